@@ -1,0 +1,1 @@
+"""Benchmarks: run time against error, beside other solvers and a hand-written C program (see README.md)."""

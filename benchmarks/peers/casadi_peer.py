@@ -1,0 +1,79 @@
+"""CasADi with SUNDIALS: CVODES on the ODE with λ eliminated symbolically, IDAS on the index-1 DAE with λ as unknown.
+
+SX expressions. CVODES as for a non-stiff problem: Adams, functional iteration; Newton, a higher order
+and compiled expressions change little. IDAS: BDF, Newton with exact Jacobians, CasADi's default.
+"""
+
+import numpy as np
+
+from . import missing, problems
+
+name = "CasADi"
+methods = ("CVODES", "IDAS")
+OPTIONS = {
+    "CVODES": {"linear_multistep_method": "adams", "nonlinear_solver_iteration": "functional"},
+    "IDAS": {},
+}
+
+
+def available():
+    return missing("casadi")
+
+
+def double_pendulum(rtol, t1=10.0, method="CVODES"):
+    return chain(2, rtol, t1, method)
+
+
+def pendulum(rtol, t1=10.0, method="CVODES"):
+    return chain(1, rtol, t1, method)
+
+
+def chain(n, rtol, t1=1.0, method="CVODES"):
+    import casadi
+
+    options = {"reltol": rtol, "abstol": rtol, "max_num_steps": 1_000_000, **OPTIONS[method]}
+    integrator = casadi.integrator("chain", method.lower(), _equations(n, method == "IDAS"), 0.0, t1, options)
+    start = casadi.DM(problems.chain_start(n))
+    multipliers = casadi.DM.zeros(n if method == "IDAS" else 0)  # at rest on a horizontal line, all are zero
+
+    def solve():
+        return integrator(x0=start, z0=multipliers)["xf"]
+
+    return np.asarray(solve()).ravel(), solve
+
+
+def _equations(n, keep_multipliers):
+    """The chain: `alg` is the tridiagonal system for the multipliers, or it is eliminated from the far end."""
+    import casadi
+
+    state = casadi.SX.sym("state", 4 * n)
+    r, v = casadi.reshape(state[: 2 * n], 2, n), casadi.reshape(state[2 * n :], 2, n)
+    gravity = casadi.DM([0.0, problems.GRAVITY])
+    d = casadi.horzcat(r[:, 0], casadi.diff(r, 1, 1))
+    w = casadi.horzcat(v[:, 0], casadi.diff(v, 1, 1))
+    diagonal = [(1 if i == 0 else 2) * casadi.sumsqr(d[:, i]) for i in range(n)]
+    right = [casadi.sumsqr(w[:, i]) + (casadi.dot(gravity, r[:, 0]) if i == 0 else 0) for i in range(n)]
+    coupling = [casadi.dot(d[:, i], d[:, i + 1]) for i in range(n - 1)]
+    equations = {"x": state}
+    if keep_multipliers:
+        tension = casadi.SX.sym("tension", n)
+        equations["z"] = tension
+        equations["alg"] = casadi.vertcat(
+            *(
+                diagonal[i] * tension[i]
+                - (coupling[i - 1] * tension[i - 1] if i > 0 else 0)
+                - (coupling[i] * tension[i + 1] if i < n - 1 else 0)
+                - right[i]
+                for i in range(n)
+            )
+        )
+    else:
+        for i in range(n - 2, -1, -1):
+            diagonal[i] -= coupling[i] ** 2 / diagonal[i + 1]
+            right[i] += coupling[i] / diagonal[i + 1] * right[i + 1]
+        tension = [right[0] / diagonal[0]]
+        for i in range(1, n):
+            tension.append((right[i] + coupling[i - 1] * tension[i - 1]) / diagonal[i])
+    pull = [tension[i] * d[:, i] for i in range(n)] + [0]
+    equations["ode"] = casadi.vertcat(casadi.vec(v), *(gravity - pull[i] + pull[i + 1] for i in range(n)))
+    return equations

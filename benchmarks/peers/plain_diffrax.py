@@ -1,0 +1,93 @@
+"""What a diffrax user writes today: the index reduced to 1 by hand, λ by `jnp.linalg.solve`, jitted `diffeqsolve`.
+
+Default settings otherwise; the sweep is `jit(vmap(diffeqsolve))`.
+"""
+
+import numpy as np
+
+from . import missing, problems
+
+name = "diffrax, hand-reduced"
+methods = ("Dopri8", "Tsit5")
+
+
+def available():
+    return missing("diffrax")
+
+
+def double_pendulum(rtol, t1=10.0, method="Dopri8"):
+    return _prepare(_double_pendulum_field, problems.chain_start(2), rtol, t1, method)
+
+
+def pendulum(rtol, t1=10.0, method="Dopri8"):
+    return _prepare(_pendulum_field, problems.chain_start(1), rtol, t1, method)
+
+
+def chain(n, rtol, t1=1.0, method="Dopri8"):
+    return _prepare(_chain_field, problems.chain_start(n), rtol, t1, method)
+
+
+def sweep(angles, rtol, t1=10.0, method="Dopri8"):
+    return _prepare(_double_pendulum_field, problems.double_pendulum_starts(angles), rtol, t1, method, batch=True)
+
+
+def _prepare(field, start, rtol, t1, method, batch=False):
+    import diffrax
+    import jax
+    import jax.numpy as jnp
+
+    jax.config.update("jax_enable_x64", True)
+
+    def one(y0):
+        sol = diffrax.diffeqsolve(
+            diffrax.ODETerm(field),
+            getattr(diffrax, method)(),
+            t0=0.0,
+            t1=t1,
+            dt0=None,
+            y0=y0,
+            stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol),
+            max_steps=100_000,
+        )
+        return sol.ys[-1]
+
+    compiled = jax.jit(jax.vmap(one) if batch else one)
+    y0 = jnp.asarray(start)
+
+    def solve():
+        return compiled(y0).block_until_ready()
+
+    return np.asarray(solve()), solve
+
+
+def _pendulum_field(t, y, args):
+    import jax.numpy as jnp
+
+    r, v = y[:2], y[2:]
+    gravity = jnp.array([0.0, problems.GRAVITY])
+    tension = (v @ v + gravity @ r) / (r @ r)
+    return jnp.concatenate([v, gravity - tension * r])
+
+
+def _double_pendulum_field(t, y, args):
+    import jax.numpy as jnp
+
+    r1, r2, v1, v2 = y[:2], y[2:4], y[4:6], y[6:]
+    gravity = jnp.array([0.0, problems.GRAVITY])
+    d, w = r2 - r1, v2 - v1
+    matrix = jnp.array([[r1 @ r1, -r1 @ d], [-r1 @ d, 2 * d @ d]])
+    tension = jnp.linalg.solve(matrix, jnp.array([v1 @ v1 + gravity @ r1, w @ w]))
+    return jnp.concatenate([v1, v2, gravity - tension[0] * r1 + tension[1] * d, gravity - tension[1] * d])
+
+
+def _chain_field(t, y, args):
+    import jax.numpy as jnp
+
+    r, v = y.reshape(2, -1, 2)
+    gravity = jnp.array([0.0, problems.GRAVITY])
+    d, w = jnp.diff(r, axis=0, prepend=jnp.zeros((1, 2))), jnp.diff(v, axis=0, prepend=jnp.zeros((1, 2)))
+    lengths, couplings = 2 * (d * d).sum(1), -(d[:-1] * d[1:]).sum(1)
+    matrix = jnp.diag(lengths.at[0].divide(2)) + jnp.diag(couplings, 1) + jnp.diag(couplings, -1)
+    tension = jnp.linalg.solve(matrix, (w * w).sum(1).at[0].add(gravity @ d[0]))
+    pull = tension[:, None] * d
+    return jnp.concatenate([v.ravel(), (gravity - pull + jnp.pad(pull[1:], ((0, 1), (0, 0)))).ravel()])

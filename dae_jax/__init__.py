@@ -1,0 +1,24 @@
+"""Differentiable solvers for differential-algebraic equations in JAX."""
+
+from .diagnostics import Drift as Drift, drift as drift, energy as energy, multipliers as multipliers
+from .formulations import (
+    AbstractFormulation as AbstractFormulation,
+    Baumgarte as Baumgarte,
+    Differentiation as Differentiation,
+    StateSpace as StateSpace,
+)
+from .initialise import consistent_state as consistent_state
+from .kernels import configure as configure
+from .solution import DAESolution as DAESolution, RESULTS as RESULTS
+from .solve import daesolve as daesolve
+from .solvers import (
+    DOP853 as DOP853,
+    RATTLE as RATTLE,
+    Gauss4 as Gauss4,
+    Midpoint as Midpoint,
+    OrthogonalProjection as OrthogonalProjection,
+    SymmetricProjection as SymmetricProjection,
+    TangentSpace as TangentSpace,
+    Trapezoid as Trapezoid,
+)
+from .systems import ConstrainedSystem as ConstrainedSystem

@@ -1,0 +1,316 @@
+"""The mathematics of a system at one instant: its underlying ODE and the manifold that this lives on.
+
+Differentiating a DAE often enough gives an underlying ODE ẏ = field(t, y) and the invariants H(t, y) = 0, the constraints
+and their hidden derivatives. Formulations and solvers see a system through this interface alone.
+"""
+
+import abc
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .kernels import scalarise
+from .linalg import fixed_point, implicit_root, relative_change, semidefinite_solve, solve
+from .structure.layout import Layout
+from .systems import ConstrainedSystem
+
+
+# Up to this many multiplications a product is written as a sum, which can become part of a kernel; a dot cannot.
+SUMMED = 4096
+
+
+def at_one_instant(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Runs a method of an `eqx.Module` as scalar arithmetic where it is small, traced once for all its call sites."""
+
+    @functools.wraps(method)
+    def wrapped(*args: Any) -> Any:
+        arrays, static = eqx.partition(args, eqx.is_array)
+        leaves, treedef = jax.tree.flatten(static)
+        return _evaluate(method, tuple(leaves), treedef, arrays)
+
+    return wrapped
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+def _evaluate(method: Callable[..., Any], leaves: tuple[Any, ...], treedef: Any, arrays: Any) -> Any:
+    static = jax.tree.unflatten(treedef, leaves)
+    return scalarise(lambda arrays: method(*eqx.combine(arrays, static)))(arrays)
+
+
+class ManifoldODE(eqx.Module):
+    """An ODE ẏ = field(t, y) with invariants H(t, y) = 0: what a formulation makes of a DAE.
+
+    It travels through `diffrax.diffeqsolve` as `args`, so that its arrays can be batched over and differentiated. `y` is
+    a pytree of flat vectors.
+    """
+
+    @abc.abstractmethod
+    def field(self, t: Any, y: Any, feedback: Any = None) -> Any:
+        """The underlying ODE at (t, y). `feedback`, a function of H and its derivatives level by level, is added to the
+        highest derivative of each constraint, which is 0 otherwise (see `Baumgarte`)."""
+
+    @abc.abstractmethod
+    def invariants(self, t: Any, y: Any) -> tuple[Float[Array, " levels"], ...]:
+        """H(t, y), level by level: the constraints, then their hidden derivatives."""
+
+    @abc.abstractmethod
+    def normals(self, t: Any, y: Any) -> Any:
+        """Directions that span a complement of the manifold's tangent space at (t, y), and what is needed to use them."""
+
+    @abc.abstractmethod
+    def shift(self, y: Any, normals: Any, mu: Any) -> Any:
+        """y + N μ, with the normals N and a flat vector μ."""
+
+    @abc.abstractmethod
+    def restore(self, t: Any, y: Any, normals: Any) -> tuple[Any, Bool[Array, ""]]:
+        """The point y + N μ on the manifold at time t, and whether it was found."""
+
+    @abc.abstractmethod
+    def tangent(self, dy: Any, normals: Any) -> Any:
+        """The part of a derivative ẏ in the tangent space to which `normals` are normal."""
+
+    @abc.abstractmethod
+    def decode(self, t: Any, y: Any) -> Any:
+        """The state in the user's structure."""
+
+
+class MechanicalODE(ManifoldODE):
+    """The underlying ODE of a `ConstrainedSystem`: y = (q, v),
+
+        q̇ = v,   M v̇ + Aᵀλ = f,   A v̇ + γ = 0,   A = [∂g/∂q; ∂h/∂v],   γ = [d(Gv + g_t)/dt; dh/dt] at v̇ = 0,
+
+    with the invariants g = 0 (position level) and (Gv + g_t, h) = 0 (velocity level).
+    """
+
+    system: ConstrainedSystem
+    args: Any
+    layout: Layout = eqx.field(static=True)
+    holonomic: int = eqx.field(static=True)
+    nonholonomic: int = eqx.field(static=True)
+    depends_on_time: tuple[bool, bool] = eqx.field(static=True)
+    rank: int | None = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, system: ConstrainedSystem, t: Any, state: Any, args: Any, rank: int | None = None) -> "MechanicalODE":
+        """Finds, while tracing, what the system has and has not; `state` = (q, v) gives shapes and types only."""
+        q, v = state
+        system, args = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, (system, args))
+        layout = Layout.of(q)
+        g, g_uses_time = _outline(system.constraint, t, q, args)
+        h, h_uses_time = _outline(system.nonholonomic, t, q, v, args)
+        rank = system.rank if rank is None else rank
+        return cls(system, args, layout, g, h, (g_uses_time, h_uses_time), rank if rank != g + h else None)
+
+    def decode(self, t: Any, y: Any) -> Any:
+        q, v = y
+        return self.layout.unflatten(q), self.layout.unflatten(v)
+
+    def encode(self, state: Any) -> Any:
+        """The flat vectors (q, v)."""
+        q, v = state
+        return self.layout.flatten(q), self.layout.flatten(v)
+
+    # The system's functions on flat vectors
+
+    def force(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
+        """f(t, q, v)."""
+        flat = self.layout.unflatten
+        return self.layout.flatten(self.system.force(t, flat(q), flat(v), self.args))
+
+    def mass(self, q: Float[Array, " n"]) -> Float[Array, "..."] | None:
+        """M(q): `None`, a vector (diagonal) or a matrix."""
+        return self.system.mass_matrix(self.layout.unflatten(q), self.args)
+
+    def constraint(self, t: Any, q: Float[Array, " n"]) -> Float[Array, " m"]:
+        """g(t, q)."""
+        if self.system.constraint is None:
+            return jnp.zeros(0, q.dtype)
+        return jnp.ravel(self.system.constraint(t, self.layout.unflatten(q), self.args))
+
+    def velocity_constraint(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " mp"]:
+        """(ġ, h) = (G v + g_t, h(t, q, v))."""
+        _, velocity = self._along(self.constraint, self.depends_on_time[0], t, (q,), (v,))
+        if self.system.nonholonomic is None:
+            return velocity
+        return jnp.concatenate([velocity, self._nonholonomic(t, q, v)])
+
+    def _nonholonomic(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " p"]:
+        assert self.system.nonholonomic is not None
+        flat = self.layout.unflatten
+        return jnp.ravel(self.system.nonholonomic(t, flat(q), flat(v), self.args))
+
+    @staticmethod
+    def _along(function: Callable[..., Any], uses_time: bool, t: Any, at: Any, direction: Any) -> Any:
+        """`function(t, *at)` and its derivative along (1, *direction); along (0, *direction) if it does not use time."""
+        if uses_time:
+            t = jnp.asarray(t, at[0].dtype)
+            return jax.jvp(function, (t, *at), (jnp.ones_like(t), *direction))
+        return jax.jvp(functools.partial(function, t), at, direction)
+
+    def constraint_jacobian(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, "mp n"]:
+        """A = [G; ∂h/∂v]."""
+        rows = []
+        if self.holonomic:
+            rows.append(jax.jacfwd(self.constraint, 1)(t, q))
+        if self.nonholonomic:
+            rows.append(jax.jacfwd(self._nonholonomic, 2)(t, q, v))
+        return jnp.concatenate(rows) if len(rows) > 1 else rows[0]
+
+    def bias(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " mp"]:
+        """γ, the second derivative of g and the first of h where v̇ = 0."""
+        uses_time = self.depends_on_time[0] or self.depends_on_time[1]
+        _, bias = self._along(
+            lambda t, q: self.velocity_constraint(t, q, v), uses_time, t, (q,), (v,)
+        )
+        return bias
+
+    # The underlying ODE
+
+    @at_one_instant
+    def field(self, t: Any, y: Any, feedback: Any = None) -> Any:
+        q, v = y
+        return v, self._accelerations(t, q, v, feedback)[0]
+
+    @at_one_instant
+    def multipliers(self, t: Any, y: Any) -> Float[Array, " mp"]:
+        """(λ, μ), of least norm where constraints are redundant."""
+        return self._accelerations(t, *y, None)[1]
+
+    def _accelerations(self, t: Any, q: Any, v: Any, feedback: Any) -> tuple[Float[Array, " n"], Float[Array, " mp"]]:
+        a, m = self.constraint_jacobian(t, q, v), self.mass(q)
+        normals = mass_solve(m, a.T)
+        free = mass_solve(m, self.force(t, q, v))
+        target = self.bias(t, q, v)
+        if feedback is not None:
+            target = target + self._feedback(t, q, v, feedback)
+        multipliers = semidefinite_solve(_matmul(a, normals), _matvec(a, free) + target, self.rank)
+        return free - _matvec(normals, multipliers), multipliers
+
+    def _feedback(self, t: Any, q: Any, v: Any, feedback: Any) -> Float[Array, " mp"]:
+        velocity = self.velocity_constraint(t, q, v)
+        terms = []
+        if self.holonomic:
+            terms.append(feedback(self.constraint(t, q), velocity[: self.holonomic]))
+        if self.nonholonomic:
+            terms.append(feedback(velocity[self.holonomic :]))
+        return jnp.concatenate(terms) if len(terms) > 1 else terms[0]
+
+    # The manifold
+
+    @at_one_instant
+    def invariants(self, t: Any, y: Any) -> tuple[Float[Array, " m"], Float[Array, " mp"]]:
+        q, v = y
+        return self.constraint(t, q), self.velocity_constraint(t, q, v)
+
+    @at_one_instant
+    def normals(self, t: Any, y: Any) -> tuple[Float[Array, "mp n"], Float[Array, "n mp"]]:
+        """A and M⁻¹Aᵀ: the normals in the metric of the mass matrix."""
+        q, v = y
+        a = self.constraint_jacobian(t, q, v)
+        return a, mass_solve(self.mass(q), a.T)
+
+    @at_one_instant
+    def tangent(self, dy: Any, normals: Any) -> Any:
+        a, n = normals
+        m = self.holonomic
+        dq, dv = dy
+        return self._tangent(a[:m], n[:, :m], dq), self._tangent(a, n, dv)
+
+    def _tangent(self, a: Float[Array, "c n"], n: Float[Array, "n c"], x: Float[Array, " n"]) -> Float[Array, " n"]:
+        if a.shape[0] == 0:
+            return x
+        return x - _matvec(n, semidefinite_solve(_matmul(a, n), _matvec(a, x), self._rank_of(a.shape[0])))
+
+    def _rank_of(self, rows: int) -> int | None:
+        """The rank of the first `rows` constraints: `rank` counts the holonomic and the nonholonomic ones together, and
+        the redundant ones are taken to be holonomic where there are any."""
+        if self.rank is None or rows == self.holonomic + self.nonholonomic:
+            return self.rank
+        return max(self.rank - self.nonholonomic, 0)
+
+    def shift(self, y: Any, normals: Any, mu: Float[Array, " c"]) -> Any:
+        _, n = normals
+        q, v = y
+        m = self.holonomic
+        return q + _matvec(n[:, :m], mu[:m]), v + _matvec(n, mu[m:])
+
+    def restore(self, t: Any, y: Any, normals: Any) -> tuple[Any, Bool[Array, ""]]:
+        q, v = y
+        m = self.holonomic
+        params = (self, t, y, normals)
+
+        def iterate(params: Any) -> tuple[Float[Array, " c"], Bool[Array, ""]]:
+            ode, t, y, normals = params
+            zero = jnp.zeros(2 * m + self.nonholonomic, q.dtype)
+            return fixed_point(lambda mu: ode.correction(t, y, normals, mu), zero)
+
+        mu, converged = implicit_root(
+            _manifold_residual, iterate, params, linear_solve=solve if self.rank is None else _minimum_norm
+        )
+        return self.shift((q, v), normals, mu), converged
+
+    @at_one_instant
+    def correction(self, t: Any, y: Any, normals: Any, mu: Float[Array, " c"]) -> tuple[Float[Array, " c"], Any]:
+        """One Newton correction of μ in H(t, y + N μ) = 0, and its size: positions first, then the velocities at them.
+
+        The matrix is A M⁻¹Aᵀ at the current point, which differs from the Jacobian A N by the square of the angle
+        between the two normal spaces and stays symmetric.
+        """
+        m = self.holonomic
+        q, v = self.shift(y, normals, mu)
+        a, n = self.normals(t, (q, v))
+        s = _matmul(a, n)
+        delta = jnp.zeros(0, q.dtype)
+        if m:
+            delta = semidefinite_solve(s[:m, :m], self.constraint(t, q), self._rank_of(m))
+            q = q - _matvec(normals[1][:, :m], delta)
+        dv = semidefinite_solve(s, self.velocity_constraint(t, q, v), self.rank)
+        sizes = [relative_change(_matvec(normals[1][:, :m], delta), q), relative_change(_matvec(normals[1], dv), v)]
+        return mu - jnp.concatenate([delta, dv]), jnp.maximum(*sizes)
+
+
+def _manifold_residual(mu: Float[Array, " c"], params: Any) -> Float[Array, " c"]:
+    ode, t, y, normals = params
+    return jnp.concatenate(ode.invariants(t, ode.shift(y, normals, mu)))
+
+
+def _minimum_norm(a: Float[Array, "c c"], b: Float[Array, " c"]) -> Float[Array, " c"]:
+    # The relative cut-off separates redundancy from conditioning: on the manifold the dependent rows agree to round-off.
+    return _matvec(jnp.linalg.pinv(a, rtol=float(jnp.finfo(a.dtype).eps) ** 0.5), b)
+
+
+def mass_solve(mass: Float[Array, "..."] | None, x: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
+    """M⁻¹ x for M as `ConstrainedSystem.mass_matrix` gives it."""
+    if mass is None:
+        return x
+    if mass.ndim < 2:
+        return x / (mass[:, None] if mass.ndim and x.ndim == 2 else mass)
+    return semidefinite_solve(mass, x)
+
+
+def _matmul(a: Float[Array, "i j"], b: Float[Array, "j k"]) -> Float[Array, "i k"]:
+    if a.size * b.shape[1] > SUMMED:
+        return jnp.dot(a, b, precision=jax.lax.Precision.HIGHEST)
+    return jnp.sum(a[:, :, None] * b[None, :, :], 1)
+
+
+def _matvec(a: Float[Array, "i j"], x: Float[Array, " j"]) -> Float[Array, " i"]:
+    return jnp.sum(a * x, 1)
+
+
+def _outline(function: Callable[..., Any] | None, *args: Any) -> tuple[int, bool]:
+    """How many numbers `function` returns, and whether it uses its first argument, time."""
+    if function is None:
+        return 0, False
+    time, *rest = args
+    arrays, static = eqx.partition(rest, eqx.is_array_like)
+    jaxpr, out = jax.make_jaxpr(lambda t, a: function(t, *eqx.combine(a, static)), return_shape=True)(time, arrays)
+    variable = jaxpr.jaxpr.invars[0]
+    used = any(variable is v for eqn in jaxpr.jaxpr.eqns for v in eqn.invars) or variable in jaxpr.jaxpr.outvars
+    return int(sum(np.prod(o.shape) for o in jax.tree.leaves(out))), used

@@ -1,0 +1,9 @@
+"""Which equations are integrated: one file a formulation.
+
+Each has `encode(system, t, state, args) → (y, ode)`, `term()` and `decode(t, y, ode) → state`; `ode` travels as the
+`args` of `diffrax.diffeqsolve`.
+"""
+
+from .baumgarte import Baumgarte as Baumgarte
+from .differentiation import AbstractFormulation as AbstractFormulation, Differentiation as Differentiation
+from .state_space import StateSpace as StateSpace

@@ -1,0 +1,47 @@
+"""Baumgarte's stabilisation (Pöll, Hafner and Heinzl, sec. 2.2)."""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from ..constraints import ManifoldODE, MechanicalODE
+from .differentiation import AbstractFormulation
+
+
+class Baumgarte(AbstractFormulation):
+    """The constraint and its derivative are fed back:
+
+        g̈ + 2α ġ + β² g = 0    in place of   g̈ = 0,
+
+    and ḣ + α h = 0 for nonholonomic constraints. Errors decay like exp(s t) with s² + 2αs + β² = 0: critically damped
+    for α = β. Large values are stiff for an explicit solver.
+
+    **Arguments**
+
+    - `alpha`, `beta`: α and β, in 1/s; arrays may be batched over and differentiated.
+
+    Source: J. Baumgarte, Comput. Methods Appl. Mech. Eng. 1 (1972), 1–16.
+    """
+
+    alpha: Float[ArrayLike, ""]
+    beta: Float[ArrayLike, ""]
+
+    def __init__(self, alpha: Float[ArrayLike, ""], beta: Float[ArrayLike, ""]) -> None:
+        # Arrays, so that another value is not another compilation.
+        self.alpha = jnp.asarray(alpha, jnp.result_type(float, alpha))
+        self.beta = jnp.asarray(beta, jnp.result_type(float, beta))
+
+    def encode(self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None) -> tuple[Any, ManifoldODE]:
+        ode = MechanicalODE.of(system, t, state, args, rank)
+        return ode.encode(state), ode
+
+    def field(self, t: Any, y: Any, ode: Any) -> Any:
+        return ode.field(t, y, self)
+
+    def __call__(self, *levels: Float[Array, " m"]) -> Float[Array, " m"]:
+        """What is added to the highest derivative of a constraint, given the constraint and its lower derivatives."""
+        if len(levels) == 1:
+            return self.alpha * levels[0]
+        g, dg = levels
+        return 2 * self.alpha * dg + self.beta**2 * g

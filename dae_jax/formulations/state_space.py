@@ -1,0 +1,144 @@
+"""State-space form in a global chart (Pöll, Hafner and Heinzl, sec. 2.6)."""
+
+import functools
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..constraints import MechanicalODE, at_one_instant
+from ..linalg import newton, semidefinite_solve
+from .differentiation import AbstractFormulation
+
+
+class StateSpace(AbstractFormulation):
+    """Coordinates z in which the constraints hold by construction, q = ψ(t, z), and the equations of motion in them,
+
+        Jᵀ M J z̈ = Jᵀ (f − M c),   J = ∂ψ/∂z,   c = d(J ż + ψ_t)/dt at z̈ = 0,
+
+    without multipliers (Maggi's equations).
+
+    **Arguments**
+
+    - `chart`: ψ, as `chart(z)` or `chart(t, z, args)`, from a vector of n − m numbers to q in the structure of q. It
+      must satisfy the constraints for every z. Its inverse at the start is found by Newton's method, from several
+      guesses.
+    - `guess`: z near the start, where the chart folds and the default guesses end on a wrong sheet.
+
+    Errors: a chart of the wrong dimension or one that does not reach the initial state is refused.
+    """
+
+    chart: Callable[..., Any]
+    guess: Any = None
+
+    def encode(self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None) -> tuple[Any, "ChartODE"]:
+        mechanical = MechanicalODE.of(system, t, state, args, rank)
+        if mechanical.nonholonomic:
+            raise ValueError(
+                "StateSpace needs a system whose constraints are all holonomic: no coordinates satisfy a nonholonomic "
+                "constraint by construction. Use OrthogonalProjection or TangentSpace."
+            )
+        constraints = mechanical.holonomic if mechanical.rank is None else mechanical.rank
+        ode = ChartODE(mechanical, self.chart, _takes_time(self.chart), mechanical.layout.size - constraints)
+        return ode.encode(t, mechanical.encode(state), self.guess), ode
+
+    def field(self, t: Any, y: Any, ode: Any) -> Any:
+        return ode.field(t, y)
+
+
+def _takes_time(chart: Callable[..., Any]) -> bool:
+    required = [
+        p
+        for p in inspect.signature(chart).parameters.values()
+        if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
+    ]
+    if len(required) not in (1, 3):
+        raise ValueError(f"`chart` must be chart(z) or chart(t, z, args), but takes {len(required)} arguments.")
+    return len(required) == 3
+
+
+class ChartODE(eqx.Module):
+    """The equations of motion in a chart; y = (z, ż)."""
+
+    mechanical: MechanicalODE
+    chart: Callable[..., Any]
+    takes_time: bool = eqx.field(static=True)
+    dimension: int = eqx.field(static=True)
+
+    def position(self, t: Any, z: Float[Array, " d"]) -> Float[Array, " n"]:
+        """ψ(t, z) as a flat vector."""
+        q = self.chart(t, z, self.mechanical.args) if self.takes_time else self.chart(z)
+        return self.mechanical.layout.flatten(q)
+
+    def velocity(self, t: Any, z: Float[Array, " d"], w: Float[Array, " d"]) -> Float[Array, " n"]:
+        """J w + ψ_t."""
+        return self.mechanical._along(self.position, self.takes_time, t, (z,), (w,))[1]
+
+    @at_one_instant
+    def field(self, t: Any, y: Any) -> Any:
+        z, w = y
+        ode = self.mechanical
+        jacobian = jax.jacfwd(self.position, 1)(t, z)
+        q, v = self.position(t, z), self.velocity(t, z, w)
+        _, bias = ode._along(lambda t, z: self.velocity(t, z, w), self.takes_time, t, (z,), (w,))
+        mass = ode.mass(q)
+        if mass is None:
+            apply: Callable[[Any], Any] = lambda x: x  # noqa: E731
+        elif mass.ndim < 2:
+            apply = lambda x: (mass * x.T).T  # noqa: E731
+        else:
+            apply = functools.partial(jnp.dot, mass)
+        reduced = jnp.dot(jacobian.T, apply(jacobian))
+        return w, semidefinite_solve(reduced, jnp.dot(jacobian.T, ode.force(t, q, v) - apply(bias)))
+
+    def decode(self, t: Any, y: Any) -> Any:
+        z, w = y
+        return self.mechanical.decode(t, (self.position(t, z), self.velocity(t, z, w)))
+
+    def encode(self, t: Any, y: Any, guess: Any) -> Any:
+        """(z, ż) of a flat (q, v), by Newton's method on Jᵀ(ψ(z) − q) = 0 from the best of several guesses."""
+        q, v = y
+        guesses = _guesses(self.dimension, q.dtype) if guess is None else jnp.atleast_2d(jnp.asarray(guess, q.dtype))
+        if guesses.shape[1] != self.dimension:
+            raise ValueError(f"`guess` must have {self.dimension} entries, but has {guesses.shape[1]}.")
+        shape = jax.eval_shape(lambda: self.position(t, guesses[0])).shape
+        if shape != q.shape:
+            raise ValueError(f"`chart` must return {q.shape[0]} numbers, as many as q has, but returns {shape[0]}.")
+
+        def refine(z: Float[Array, " d"]) -> tuple[Float[Array, " d"], Float[Array, ""]]:
+            def step(_: Any, z: Float[Array, " d"]) -> Float[Array, " d"]:
+                delta = _least_squares(self, t, z, self.position(t, z) - q)
+                return z - delta * jnp.minimum(1, 1 / (jnp.max(jnp.abs(delta)) + 1e-30))
+
+            z = jax.lax.fori_loop(0, 40, step, z)
+            distance = jnp.sum((self.position(t, z) - q) ** 2)
+            return z, jnp.where(jnp.isfinite(distance), distance, jnp.inf)
+
+        zs, distances = jax.vmap(refine)(jax.lax.stop_gradient(guesses))
+        nearest = jnp.argmin(distances)
+        params = (self, t, q)
+        z, _ = newton(_normal_equations, jax.lax.stop_gradient(zs[nearest]), params)
+        reached = jnp.sqrt(distances[nearest]) <= jnp.finfo(q.dtype).eps ** 0.5 * (1 + jnp.max(jnp.abs(q)))
+        z = jnp.where(reached, z, jnp.nan)
+        return z, _least_squares(self, t, z, v - self.velocity(t, z, jnp.zeros_like(z)))
+
+
+def _normal_equations(z: Float[Array, " d"], params: Any) -> Float[Array, " d"]:
+    ode, t, q = params
+    return jnp.dot(jax.jacfwd(ode.position, 1)(t, z).T, ode.position(t, z) - q)
+
+
+def _least_squares(ode: ChartODE, t: Any, z: Float[Array, " d"], x: Float[Array, " n"]) -> Float[Array, " d"]:
+    jacobian = jax.jacfwd(ode.position, 1)(t, z)
+    return semidefinite_solve(jnp.dot(jacobian.T, jacobian), jnp.dot(jacobian.T, x))
+
+
+def _guesses(dimension: int, dtype: Any) -> Float[Array, "guesses d"]:
+    # Fixed, spread over the range of an angle: a chart is usually made of angles.
+    rng = np.random.default_rng(0)
+    return jnp.asarray(np.concatenate([np.full((1, dimension), 0.1), rng.uniform(-3, 3, (31, dimension))]), dtype)

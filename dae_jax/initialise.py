@@ -1,0 +1,136 @@
+"""Consistent initial states: how far a state is off, and the nearest one that is not."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .constraints import MechanicalODE, mass_solve
+from .linalg import fixed_point, implicit_root, relative_change
+from .systems import ConstrainedSystem
+
+
+class Violation(eqx.Module):
+    """By how much a state (q, v) violates its constraints.
+
+    `residuals`: g and (ġ, h); `distances`: the same divided by the length of each constraint's gradient, that is about
+    how far the state is from satisfying it; `allowed`: the distance that counts as round-off of the user's numbers, for
+    each level; `rank`: how many constraints are independent; `contradiction`: the part of the accelerations' right-hand
+    side that no multipliers can satisfy, relative to its size.
+    """
+
+    residuals: tuple[Float[Array, " m"], Float[Array, " mp"]]
+    distances: tuple[Float[Array, " m"], Float[Array, " mp"]]
+    allowed: tuple[Float[Array, ""], Float[Array, ""]]
+    rank: Any
+    contradiction: Float[Array, ""]
+
+    def consistent(self) -> Bool[Array, ""]:
+        """Whether every level is within `allowed`; false for NaN."""
+        within = [jnp.all(d <= a) for d, a in zip(self.distances, self.allowed, strict=True)]
+        return jnp.asarray(within[0] & within[1])
+
+    def message(self) -> str:
+        """Which equations are off, at which level and by how much."""
+        lines = []
+        names = (("position level", "g"), ("velocity level", "dg/dt, then h"))
+        for (level, symbol), residual, distance, allowed in zip(
+            names, self.residuals, self.distances, self.allowed, strict=True
+        ):
+            for i in np.flatnonzero(~(np.asarray(distance) <= np.asarray(allowed))):
+                lines.append(f"  {level}: 0 = constraint[{i}] ({symbol}) is off by {float(residual[i]):.6g}")
+        return "The initial state `y0` violates the constraints:\n" + "\n".join(lines)
+
+
+def violation(ode: MechanicalODE, t: Any, y: Any) -> Violation:
+    """How far the flat state y = (q, v) is from the manifold."""
+    q, v = y
+    residuals = ode.invariants(t, y)
+    a, normals = ode.normals(t, y)
+    lengths = jnp.sqrt(jnp.sum(a * a, 1))
+    lengths = jnp.where(lengths > 0, lengths, 1)
+    distances = tuple(
+        jnp.abs(r) / length for r, length in zip(residuals, (lengths[: ode.holonomic], lengths), strict=True)
+    )
+    root = jnp.finfo(q.dtype).eps ** 0.5
+    allowed = tuple(root * (1 + jnp.max(jnp.abs(x))) for x in (q, v))
+    schur = jnp.dot(a, normals)
+    scale = 1 / lengths
+    eigenvalues, vectors = jnp.linalg.eigh(schur * scale[:, None] * scale[None, :])
+    independent = eigenvalues > root * jnp.max(eigenvalues)
+    free = mass_solve(ode.mass(q), ode.force(t, q, v))
+    target = (jnp.dot(a, free) + ode.bias(t, q, v)) * scale
+    dependent = jnp.where(independent, 0, jnp.dot(vectors.T, target))
+    contradiction = jnp.max(jnp.abs(dependent)) / (1 + jnp.max(jnp.abs(target)))
+    return Violation(residuals, distances, allowed, jnp.sum(independent), contradiction)
+
+
+def consistent_state(system: ConstrainedSystem, t0: Any, y0: Any, args: Any = None, *, fixed: Any = None) -> Any:
+    """The nearest state (q, v) that satisfies the constraints and the hidden ones.
+
+    Positions: the q with g(t₀, q) = 0 nearest to q₀ in the metric of the mass matrix at q₀; then the v with
+    G v + g_t = 0 and h = 0 nearest to v₀ in the same metric. Differentiable with respect to `y0` and `args`.
+
+    **Arguments**
+
+    - `fixed`: a pytree of booleans (or boolean arrays) with the structure of `y0`; entries marked true are kept.
+
+    Errors: `ValueError` where no such state is found from here, naming the equations that remain off; NaN where the
+    arguments are traced.
+    """
+    y0 = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
+    ode = MechanicalODE.of(system, t0, y0, args)
+    masks = jax.tree.map(lambda x: jnp.zeros_like(x, dtype=bool), y0)
+    if fixed is not None:
+        masks = jax.tree.map(lambda f, x: jnp.broadcast_to(jnp.asarray(f, bool), jnp.shape(x)), fixed, y0)
+    q, v = ode.encode(y0)
+    weights = tuple(jnp.where(mask, 0, 1).astype(q.dtype) for mask in ode.encode(masks))
+    y, found, remains = _nearest(ode, jnp.asarray(t0, q.dtype), (q, v), weights)
+    if not isinstance(found, jax.core.Tracer) and not bool(found):
+        raise ValueError(
+            remains.message().replace("The initial state `y0` violates", "No consistent state was found near `y0`; left over are")
+            + "\nThe constraints may contradict each other, or too many entries are fixed."
+        )
+    return ode.decode(t0, y)
+
+
+@eqx.filter_jit
+def _nearest(ode: MechanicalODE, t: Any, y: Any, weights: Any) -> Any:
+    params = (ode, t, y, weights)
+
+    def iterate(params: Any) -> Any:
+        def correct(x: Any) -> Any:
+            new = _improved(x, params)
+            return new, relative_change(new - x, x)
+
+        return fixed_point(correct, jnp.concatenate(params[2]), 100)
+
+    x, _ = implicit_root(lambda x, p: x - _improved(x, p), iterate, params)
+    q, v = jnp.split(x, 2)
+    remains = violation(ode, t, (q, v))
+    found = remains.consistent()
+    return jax.tree.map(lambda z: jnp.where(found, z, jnp.nan), (q, v)), found, remains
+
+
+def _improved(x: Float[Array, " 2n"], params: Any) -> Float[Array, " 2n"]:
+    """A Gauss–Newton step towards the constrained minimum of the distance to the given state."""
+    ode, t, (q0, v0), (wq, wv) = params
+    q, v = jnp.split(x, 2)
+    m = ode.holonomic
+    a = ode.normals(t, (q, v))[0]
+    metric = lambda w, rows: w[:, None] * mass_solve(ode.mass(q0), (rows * w).T)  # noqa: E731
+    g, _ = ode.invariants(t, (q, v))
+    if m:
+        q = q0 - _least_norm(a[:m], metric(wq, a[:m]), g + jnp.dot(a[:m], q0 - q))
+    _, h = ode.invariants(t, (q, v))
+    v = v0 - _least_norm(a, metric(wv, a), h + jnp.dot(a, v0 - v))
+    return jnp.concatenate([q, v])
+
+
+def _least_norm(a: Float[Array, "c n"], n: Float[Array, "n c"], b: Float[Array, " c"]) -> Float[Array, " n"]:
+    schur = jnp.dot(a, n)
+    cut = float(jnp.finfo(schur.dtype).eps) ** 0.5
+    return jnp.dot(n, jnp.dot(jnp.linalg.pinv(schur, rtol=cut, hermitian=True), b))

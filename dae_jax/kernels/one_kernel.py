@@ -1,0 +1,215 @@
+"""A whole loop compiled into one kernel on XLA's CPU backend.
+
+XLA:CPU runs a loop body as a sequence of kernels and pays for each launch; for scenes of a few bodies the launches cost
+4 to 12 times the arithmetic. A computation marked `xla_cpu_small_call` is emitted as a single function instead. All
+that it contains must then be plain arithmetic, so the jaxpr is looked at first.
+"""
+
+import contextlib
+import contextvars
+import math
+from collections.abc import Callable, Iterator
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
+from jax.experimental.xla_metadata import set_xla_metadata
+from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
+
+
+# What XLA:CPU cannot emit inside a single function: library calls, host callbacks, collectives, sorts.
+_REFUSED = frozenset(
+    "all_gather all_to_all approx_top_k cholesky conv_general_dilated custom_call debug_callback eig eigh ffi_call "
+    "fft geqrf hessenberg householder_product infeed io_callback lu ormqr outfeed ppermute psum pure_callback qr "
+    "random_gamma schur sort svd threefry2x32 top_k triangular_solve tridiagonal tridiagonal_solve".split()
+)
+SMALL_DOT = 64
+_enabled: contextvars.ContextVar[bool] = contextvars.ContextVar("one_kernel", default=True)
+
+
+@contextlib.contextmanager
+def configure(*, one_kernel: bool) -> Iterator[None]:
+    """Switches one-kernel compilation on or off for solves that are traced inside the `with` block."""
+    token = _enabled.set(one_kernel)
+    try:
+        yield
+    finally:
+        _enabled.reset(token)
+
+
+def hindrances(jaxpr: ClosedJaxpr | Jaxpr) -> tuple[str, ...]:
+    """The names of the primitives in `jaxpr`, at any depth, that keep it from being one kernel; empty if none does."""
+    return tuple(dict.fromkeys(eqn.primitive.name for eqn in _equations(jaxpr) if _hinders(eqn)))
+
+
+def _hinders(eqn: Any) -> bool:
+    name = eqn.primitive.name
+    if name.startswith("scatter"):
+        # A single window is a dynamic update; several, as under `vmap`, are a loop that cannot be emitted.
+        return math.prod(eqn.invars[1].aval.shape[:-1]) > 1
+    if name == "dot_general":
+        # XLA writes out a small product; a larger one is a library call.
+        (contracted, _), _ = eqn.params["dimension_numbers"]
+        shape = eqn.invars[0].aval.shape
+        return eqn.outvars[0].aval.size * math.prod(shape[i] for i in contracted) > SMALL_DOT
+    return name in _REFUSED
+
+
+def _equations(jaxpr: ClosedJaxpr | Jaxpr) -> Iterator[Any]:
+    for eqn in (jaxpr.jaxpr if isinstance(jaxpr, ClosedJaxpr) else jaxpr).eqns:
+        yield eqn
+        yield from _equations_in(eqn)
+
+
+def _equations_in(eqn: Any) -> Iterator[Any]:
+    for param in jax.tree.leaves(tuple(eqn.params.values()), is_leaf=_is_jaxpr):
+        if _is_jaxpr(param):
+            yield from _equations(param)
+
+
+def _is_jaxpr(x: Any) -> bool:
+    return isinstance(x, ClosedJaxpr | Jaxpr)
+
+
+def without_checks(fn: Callable[..., Any]) -> Callable[..., Any]:
+    """`fn` without `equinox.error_if`: for conditions that the caller has looked at already."""
+
+    def unchecked(*args: Any) -> Any:
+        jaxpr, out = jax.make_jaxpr(fn, return_shape=True)(*args)
+        results = _evaluate(jaxpr.jaxpr, jaxpr.consts, jax.tree.leaves(args))
+        return jax.tree.unflatten(jax.tree.structure(out), results)
+
+    return unchecked
+
+
+def _evaluate(jaxpr: Jaxpr, consts: Any, args: Any) -> list[Any]:
+    env = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *args], strict=True))
+
+    def read(v: Any) -> Any:
+        return v.val if isinstance(v, jax.extend.core.Literal) else env[v]
+
+    for eqn in jaxpr.eqns:
+        values = [read(v) for v in eqn.invars]
+        inner = _unchecked(eqn)
+        if inner is not None:
+            results = _evaluate(inner.jaxpr, inner.consts, values[len(values) - len(inner.jaxpr.invars) :])
+        else:
+            results = eqn.primitive.bind(*values, **eqn.primitive.get_bind_params(eqn.params))
+            results = results if eqn.primitive.multiple_results else [results]
+        env.update(zip(eqn.outvars, results, strict=True))
+    return [read(v) for v in jaxpr.outvars]
+
+
+def _unchecked(eqn: Any) -> ClosedJaxpr | None:
+    """What to run in place of an equation with a check in it; `None` if there is none."""
+    name = eqn.primitive.name
+    if name not in ("jit", "pjit", "custom_jvp_call", "cond") or not any(map(_is_check, _equations_in(eqn))):
+        return None
+    if name == "cond":
+        return next((b for b in eqn.params["branches"] if not any(map(_is_check, _equations(b)))), None)
+    return eqn.params["call_jaxpr" if name == "custom_jvp_call" else "jaxpr"]
+
+
+def _is_check(eqn: Any) -> bool:
+    if eqn.primitive.name != "pure_callback":
+        return False
+    callback = getattr(eqn.params["callback"], "callback_func", None)
+    return getattr(callback, "__module__", None) == "equinox._errors"
+
+
+def one_kernel(
+    fn: Callable[..., Any], derivative: Literal["forward", "reverse", "any"] = "any"
+) -> Callable[..., Any]:
+    """`fn` (pytrees of arrays to a pytree of arrays), compiled to one kernel on the CPU where it qualifies.
+
+    On another backend, or where `hindrances` finds a reason, it is `fn` itself. Under `vmap` the batched function is
+    looked at afresh. `derivative` says in which mode `fn` can be differentiated: the forward derivative is again one
+    kernel where it qualifies, a reverse derivative is that of the plain `fn`, and "any" is the plain `fn` throughout.
+    """
+    if not _enabled.get() or jax.default_backend() != "cpu" or derivative == "any":
+        return fn
+    return _forward(fn) if derivative == "forward" else _reverse(fn)
+
+
+def _reverse(fn: Callable[..., Any]) -> Callable[..., Any]:
+    def flat(*args: Any) -> Any:
+        # The custom rule sees a flat list, so that integer leaves can have no cotangent.
+        leaves, treedef = jax.tree.flatten(args)
+        inexact = [jnp.issubdtype(jnp.result_type(x), jnp.inexact) for x in leaves]
+
+        @jax.custom_vjp
+        def solve(*xs: Any) -> Any:
+            return _fused(lambda *ys: fn(*jax.tree.unflatten(treedef, ys)))(*xs)
+
+        def forward(*xs: Any) -> Any:
+            def of_inexact(*zs: Any) -> Any:
+                rest = iter(zs)
+                merged = [next(rest) if i else x for i, x in zip(inexact, xs, strict=True)]
+                return fn(*jax.tree.unflatten(treedef, merged))
+
+            return jax.vjp(of_inexact, *(x for i, x in zip(inexact, xs, strict=True) if i))
+
+        def backward(pullback: Any, cotangent: Any) -> Any:
+            cotangents = iter(pullback(cotangent))
+            return tuple(next(cotangents) if i else None for i in inexact)
+
+        solve.defvjp(forward, backward)
+        return solve(*leaves)
+
+    return flat
+
+
+def _forward(fn: Callable[..., Any]) -> Callable[..., Any]:
+    @jax.custom_jvp
+    def solve(*args: Any) -> Any:
+        return _fused(fn)(*args)
+
+    @solve.defjvp
+    def _(primals: Any, tangents: Any) -> Any:
+        return _forward(lambda p, t: jax.jvp(fn, p, t))(primals, tangents)
+
+    return solve
+
+
+def _fused(fn: Callable[..., Any]) -> Callable[..., Any]:
+    def traced(*args: Any) -> Any:
+        leaves, treedef = jax.tree.flatten(args)
+        structure: list[Any] = []
+
+        def flat(*flat_leaves: Any) -> list[Any]:
+            out, tree = jax.tree.flatten(fn(*jax.tree.unflatten(treedef, flat_leaves)))
+            structure[:] = [tree]
+            return out
+
+        @custom_vmap
+        def call(*xs: Any) -> list[Any]:
+            return _compile(flat, xs)
+
+        @call.def_vmap
+        def _(axis_size: int, batched: list[bool], *xs: Any) -> Any:
+            axes = [0 if b else None for b in batched]
+            varies: list[bool] = []
+
+            def lane(*ys: Any) -> list[Any]:
+                out = flat(*ys)
+                # `jacfwd` asks that a value which does not depend on the direction stays unbatched.
+                varies[:] = [getattr(o, "batch_dim", None) is not None for o in out]
+                return out
+
+            out = _compile(jax.vmap(lane, in_axes=axes, axis_size=axis_size), xs)
+            return [o if v else o[0] for o, v in zip(out, varies, strict=True)], varies
+
+        out = call(*leaves)
+        return jax.tree.unflatten(structure[0], out)
+
+    return traced
+
+
+def _compile(fn: Callable[..., Any], args: Any) -> Any:
+    jaxpr = jax.make_jaxpr(without_checks(fn))(*args)
+    call = jax.jit(jaxpr_as_fun(jaxpr))
+    if hindrances(jaxpr):
+        return call(*args)
+    with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
+        return call(*args)

@@ -1,0 +1,11 @@
+"""Linear and nonlinear equations of a few unknowns, solved in plain arithmetic; LAPACK above a measured size."""
+
+from .dense import solve as solve
+from .newton import (
+    fixed_point as fixed_point,
+    implicit_root as implicit_root,
+    newton as newton,
+    relative_change as relative_change,
+    roundoff as roundoff,
+)
+from .semidefinite import semidefinite_solve as semidefinite_solve

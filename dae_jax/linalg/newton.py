@@ -1,0 +1,117 @@
+"""Nonlinear equations: Newton's method to round-off, and the derivative of its solution.
+
+The tolerances of every nonlinear solve of the library are stated here and nowhere else.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from .dense import solve
+
+
+MAX_STEPS = 20
+
+
+def roundoff(dtype: Any) -> float:
+    """How small the error of a solved unknown is, relative to 1 + its size, when it counts as solved."""
+    return 4 * float(jnp.finfo(dtype).eps)
+
+
+def relative_change(delta: Float[Array, " n"], x: Float[Array, " n"]) -> Float[Array, ""]:
+    """The size of a correction `delta` relative to 1 + the size of `x`, in the maximum norm."""
+    return jnp.max(jnp.abs(delta), initial=0.0) / (1 + jnp.max(jnp.abs(x), initial=0.0))
+
+
+def newton(
+    residual: Callable[[Float[Array, " n"], Any], Float[Array, " n"]],
+    x0: Float[Array, " n"],
+    params: Any,
+    *,
+    linear_solve: Callable[[Float[Array, "n n"], Float[Array, " n"]], Float[Array, " n"]] = solve,
+    max_steps: int = MAX_STEPS,
+) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
+    """x with residual(x, params) = 0 by Newton's method from `x0`, and whether it was found.
+
+    Corrections δₖ are made until what remains, δₖ²/δₖ₋₁ by the observed rate of convergence, is round-off, or until
+    they no longer shrink and are within 1000 times of it (the residual's own round-off, amplified by an ill-conditioned
+    Jacobian). The solution is differentiated implicitly, dx = −(∂F/∂x)⁻¹ ∂F/∂params dparams, in both modes and to any
+    order; `x0` has no derivative.
+    """
+
+    def from_start(x: Float[Array, " n"], given: Any) -> Float[Array, " n"]:
+        return residual(x, given[0])
+
+    def iterate(given: Any) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
+        params, start = given
+
+        def correct(x: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
+            delta = linear_solve(jax.jacfwd(residual)(x, params), residual(x, params))
+            return x - delta, relative_change(delta, x)
+
+        return fixed_point(correct, start, max_steps)
+
+    # The start is handed over, not closed over: the derivative rule may run when the trace it is of has ended.
+    return implicit_root(from_start, iterate, (params, lax.stop_gradient(x0)), linear_solve=linear_solve)
+
+
+def fixed_point(
+    correct: Callable[[Any], tuple[Any, Float[Array, ""]]], x0: Any, max_steps: int = MAX_STEPS
+) -> tuple[Any, Bool[Array, ""]]:
+    """Applies `correct`: x ↦ (x, relative size of the correction) until what remains is round-off; see `newton`."""
+    _, size = jax.eval_shape(correct, x0)
+    tolerance = roundoff(size.dtype)
+    one = jnp.ones((), size.dtype)
+
+    def unfinished(carry: Any) -> Bool[Array, ""]:
+        _, last, previous, count = carry
+        remaining = last * jnp.minimum(last / previous, 1)
+        stagnant = (last > previous / 2) & (last < 1000 * tolerance)
+        # A NaN compares false and ends the loop.
+        return (count < max_steps) & (remaining > tolerance) & ~stagnant
+
+    def body(carry: Any) -> Any:
+        x, last, _, count = carry
+        x, size = correct(x)
+        return x, size, jnp.maximum(last, jnp.finfo(last.dtype).tiny), count + 1
+
+    # The correction before the first counts as 1, so that a first correction δ is expected to leave δ² behind.
+    x, size = correct(x0)
+    x, last, previous, _ = lax.while_loop(unfinished, body, (x, size, one, 1))
+    remaining = last * jnp.minimum(last / previous, 1)
+    return x, (remaining <= tolerance) | (last < 1000 * tolerance)
+
+
+def implicit_root(
+    residual: Callable[[Float[Array, " n"], Any], Float[Array, " n"]],
+    iterate: Callable[[Any], tuple[Float[Array, " n"], Bool[Array, ""]]],
+    params: Any,
+    *,
+    linear_solve: Callable[[Float[Array, "n n"], Float[Array, " n"]], Float[Array, " n"]] = solve,
+) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
+    """`iterate(params)` → (x, converged) with the derivative of the solution of residual(x, params) = 0.
+
+    By the implicit function theorem; the iteration is not differentiated. Everything that is traced and that `residual`
+    or `iterate` depends on must be in `params`, a pytree.
+    """
+    arrays, static = eqx.partition(params, eqx.is_array)
+
+    @jax.custom_jvp
+    def find(arrays: Any) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
+        return iterate(eqx.combine(arrays, static))
+
+    @find.defjvp
+    def _(primals: Any, tangents: Any) -> Any:
+        (arrays,), (directions,) = primals, tangents
+        x, converged = find(arrays)
+        _, change = jax.jvp(lambda a: residual(x, eqx.combine(a, static)), (arrays,), (directions,))
+        dx = -linear_solve(jax.jacfwd(residual)(x, eqx.combine(arrays, static)), change)
+        return (x, converged), (dx, np.zeros((), jax.dtypes.float0))
+
+    return find(arrays)

@@ -1,0 +1,108 @@
+"""Symmetric positive (semi)definite systems S x = b, such as G M⁻¹ Gᵀ λ = b."""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+# Up to UNROLLED unknowns the elimination is straight-line code; up to LOOPED a loop over columns, which still compiles
+# into one kernel; LAPACK above.
+UNROLLED = 8
+LOOPED = 48
+
+
+def semidefinite_solve(
+    s: Float[Array, "m m"], b: Float[Array, "m *k"], rank: int | None = None
+) -> Float[Array, "m *k"]:
+    """x with S x = b for symmetric positive definite S, or of the least norm where S has the given `rank` < m.
+
+    The definite case is S = L D Lᵀ without pivoting (stable for definite S: Higham, *Accuracy and Stability of
+    Numerical Algorithms*, ch. 10). A pivot that is not positive beyond round-off gives NaN: the system is not definite,
+    and no number would be right.
+
+    In the semidefinite case the `rank` largest eigenvalues are kept, by LAPACK.
+    """
+    m = s.shape[0]
+    if rank is not None and rank < m:
+        return _minimum_norm(s, b, rank)
+    if m > LOOPED:
+        factor = jax.scipy.linalg.cho_factor(s, lower=True)
+        return jax.scipy.linalg.cho_solve(factor, b)
+    if m > UNROLLED:
+        return _looped(s, b)
+    return _unrolled(s, b)
+
+
+def _threshold(s: Float[Array, "m m"]) -> float:
+    """The relative size below which a pivot of S is round-off."""
+    return 8 * s.shape[0] * float(jnp.finfo(s.dtype).eps)
+
+
+def _unrolled(s: Float[Array, "m m"], b: Float[Array, "m *k"]) -> Float[Array, "m *k"]:
+    m = s.shape[0]
+    threshold = _threshold(s)
+    lower: list[list[Array]] = [[] for _ in range(m)]  # L D, row by row
+    inverse: list[Array] = []  # 1 / D
+    x: list[Array] = []
+    for i in range(m):
+        for j in range(i + 1):
+            lower[i].append(s[i, j] - _sum(lower[i][k] * (lower[j][k] * inverse[k]) for k in range(j)))
+        pivot = lower[i][i]
+        inverse.append(1 / jnp.where(pivot > threshold * s[i, i], pivot, jnp.nan))
+        x.append(b[i] - _sum(lower[i][k] * x[k] for k in range(i)))
+        x[i] = x[i] * inverse[i]
+    for i in reversed(range(m)):
+        x[i] = x[i] - _sum((lower[k][i] * inverse[i]) * x[k] for k in range(i + 1, m))
+    return jnp.stack(x) if m else b
+
+
+def _sum(terms):
+    terms = list(terms)
+    return sum(terms[1:], terms[0]) if terms else 0.0
+
+
+def _looped(s: Float[Array, "m m"], b: Float[Array, "m *k"]) -> Float[Array, "m *k"]:
+    """Gauss–Jordan elimination without pivoting, a column at a time, on [S | b]."""
+    m = s.shape[0]
+    threshold = _threshold(s)
+    diagonal = jnp.diagonal(s)
+    rhs = b if b.ndim == 2 else b[:, None]
+    rows = jnp.arange(m)
+
+    def eliminate(j, carry):
+        s, rhs = carry
+        pivot = s[j, j]
+        inverse = 1 / jnp.where(pivot > threshold * diagonal[j], pivot, jnp.nan)
+        row, right = s[j] * inverse, rhs[j] * inverse
+        # Row j becomes the scaled pivot row; from every other row its multiple is taken.
+        factor = jnp.where((rows == j)[:, None], pivot - 1, s[:, j][:, None])
+        return s - factor * row, rhs - factor * right
+
+    _, rhs = jax.lax.fori_loop(0, m, eliminate, (s, rhs))
+    return rhs if b.ndim == 2 else rhs[:, 0]
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
+def _minimum_norm(s: Float[Array, "m m"], b: Float[Array, "m *k"], rank: int) -> Float[Array, "m *k"]:
+    return jnp.dot(_pseudo_inverse(s, rank), b)
+
+
+@_minimum_norm.defjvp
+def _(rank: int, primals: Any, tangents: Any) -> Any:
+    # Of constant rank: Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973), eq. 4.12, for symmetric S.
+    (s, b), (ds, db) = primals, tangents
+    inverse = _pseudo_inverse(s, rank)
+    x = jnp.dot(inverse, b)
+    residual = b - jnp.dot(s, x)
+    into_null_space = jnp.dot(ds, jnp.dot(inverse, x))
+    dx = jnp.dot(inverse, db - jnp.dot(ds, x) + jnp.dot(inverse, jnp.dot(ds, residual)))
+    return x, dx + into_null_space - jnp.dot(inverse, jnp.dot(s, into_null_space))
+
+
+def _pseudo_inverse(s: Float[Array, "m m"], rank: int) -> Float[Array, "m m"]:
+    values, vectors = jnp.linalg.eigh(s)
+    values, vectors = values[s.shape[0] - rank :], vectors[:, s.shape[0] - rank :]
+    return jnp.dot(vectors / values, vectors.T)

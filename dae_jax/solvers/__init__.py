@@ -1,0 +1,12 @@
+"""How one step is taken: one file a method, each a diffrax solver."""
+
+from .dop853 import DOP853 as DOP853
+from .explicit import unrolled as unrolled
+from .gauss import Gauss4 as Gauss4
+from .manifold import AbstractManifoldSolver as AbstractManifoldSolver
+from .midpoint import Midpoint as Midpoint
+from .orthogonal_projection import OrthogonalProjection as OrthogonalProjection
+from .rattle import RATTLE as RATTLE
+from .symmetric_projection import SymmetricProjection as SymmetricProjection
+from .tangent_space import TangentSpace as TangentSpace
+from .trapezoid import Trapezoid as Trapezoid

@@ -1,0 +1,112 @@
+"""DOP853: an explicit Runge–Kutta method of order 8, for accuracies of 1e-6 and better."""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+
+from . import dop853_coefficients as coefficients
+from .explicit import combine, first_derivative, identity, increments
+
+
+STAGES = 12
+_ROWS = tuple(coefficients.A[i, :i] for i in range(1, 16))
+
+
+class _Interpolation(diffrax.AbstractLocalInterpolation):
+    """The interpolant of order 7; `f` are the coefficients of its nested form."""
+
+    t0: Any
+    t1: Any
+    y0: Any
+    f: Any
+
+    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Any:
+        if t1 is not None:
+            return jax.tree.map(lambda a, b: b - a, self.evaluate(t0), self.evaluate(t1))
+        x = (t0 - self.t0) / jnp.where(self.t1 == self.t0, 1, self.t1 - self.t0)
+
+        def nested(y0: Any, f: Any) -> Any:
+            y = jnp.zeros_like(y0)
+            for i in reversed(range(len(f))):
+                y = (y + f[i]) * (x if i % 2 == 0 else 1 - x)
+            return y0 + y
+
+        return jax.tree.map(nested, self.y0, self.f)
+
+
+class DOP853(diffrax.AbstractAdaptiveSolver):
+    """Dormand and Prince's method of order 8 with twelve stages, first same as last.
+
+    Two error estimates, of order 5 and 3, are combined as in Hairer and Wanner's program,
+    err = |e₅| |e₅| / √(|e₅|² + 0.01 |e₃|²). Dense output of order 7 takes three more evaluations a step; with `dense`
+    false they are left out and points between steps cannot be had (`daesolve` sets it as `saveat` and `event` need it).
+
+    Source: E. Hairer, S. P. Nørsett, G. Wanner, *Solving Ordinary Differential Equations I*, 2nd ed., II.5, II.6, II.10.
+    """
+
+    dense: bool = True
+
+    term_structure = diffrax.ODETerm
+    interpolation_cls = _Interpolation
+
+    def order(self, terms: Any) -> int:
+        return 8
+
+    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+        return terms.vf(t0, y0, args)
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Any:
+        return terms.vf(t0, y0, args)
+
+    def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any) -> Any:
+        *step, _ = self.landing_step(terms, t0, t1, y0, args, solver_state, made_jump, identity)
+        return *step, diffrax.RESULTS.successful
+
+    def landing_step(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, state: Any, made_jump: Any, land: Callable[..., Any]
+    ) -> Any:
+        """`step`, with its end moved to `land(t1, y1)` → (y1, found)."""
+        control = terms.contr(t0, t1)
+
+        def vector(t: Any, y: Any) -> Any:
+            return jax.tree.map(lambda x: control * x, terms.vf(t, y, args))
+
+        f0 = first_derivative(lambda t, y: terms.vf(t, y, args), t0, y0, state, made_jump)
+        k0 = jax.tree.map(lambda x: control * x, f0)
+        ks = increments(_ROWS[: STAGES - 1], coefficients.C[1:STAGES], vector, t0, t1, y0, k0)
+        y1, found = land(t1, combine(coefficients.B, ks, y0))
+        f1 = terms.vf(t1, y1, args)
+        ks.append(jax.tree.map(lambda x: control * x, f1))
+        error = _error(combine(coefficients.E5, ks), combine(coefficients.E3, ks), y0, y1)
+        dense = {"y0": y0, "f": self._interpolant(vector, t0, t1, y0, y1, ks) if self.dense else _linear(y0, y1)}
+        return y1, error, dense, f1, found
+
+    def _interpolant(self, vector: Callable[..., Any], t0: Any, t1: Any, y0: Any, y1: Any, ks: list[Any]) -> Any:
+        for row, c in zip(_ROWS[STAGES:], coefficients.C[STAGES + 1 :], strict=True):
+            ks = [*ks, vector(t0 + float(c) * (t1 - t0), combine(row, ks, y0))]
+
+        def nested(y0: Any, y1: Any, k0: Any, k1: Any, *rest: Any) -> Any:
+            return jnp.stack([y1 - y0, k0 - (y1 - y0), 2 * (y1 - y0) - (k0 + k1), *rest])
+
+        rest = [combine(row, ks) for row in coefficients.D]
+        return jax.tree.map(nested, y0, y1, ks[0], ks[STAGES], *rest)
+
+
+def _linear(y0: Any, y1: Any) -> Any:
+    return jax.tree.map(lambda a, b: (b - a)[None], y0, y1)
+
+
+def _error(e5: Any, e3: Any, y0: Any, y1: Any) -> Any:
+    def squares(e: Any) -> Any:
+        # Relative to 1 + |y|, the scale of equal relative and absolute tolerances; only the ratio of the two counts.
+        scaled = jax.tree.map(lambda e, a, b: jnp.sum((e / (1 + jnp.maximum(jnp.abs(a), jnp.abs(b)))) ** 2), e, y0, y1)
+        return sum(jax.tree.leaves(scaled))
+
+    five, three = squares(e5), squares(e3)
+    ratio = five / (five + 0.01 * three + float(jnp.finfo(five.dtype).tiny))
+    # The derivative of the square root at 0 is infinite; an error of 0 needs none.
+    weight = jnp.sqrt(jnp.where(ratio > 0, ratio, 1)) * (ratio > 0)
+    return jax.tree.map(lambda e: weight * e, e5)

@@ -1,0 +1,111 @@
+"""Explicit Runge–Kutta steps with the stages written out and the zero coefficients left out."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def identity(t: Any, y: Any) -> tuple[Any, bool]:
+    """Lands nowhere else."""
+    return y, True
+
+
+def combine(coefficients: Sequence[float] | np.ndarray, stages: Sequence[Any], y: Any = None) -> Any:
+    """y + Σ cᵢ kᵢ over the coefficients that are not zero."""
+    pairs = [(float(c), k) for c, k in zip(coefficients, stages, strict=False) if c != 0]
+    trees = [k for _, k in pairs] + ([] if y is None else [y])
+
+    def add(*leaves: Any) -> Any:
+        total = sum(c * leaf for (c, _), leaf in zip(pairs, leaves, strict=False))
+        return total if y is None else leaves[-1] + total
+
+    return jax.tree.map(add, *trees)
+
+
+def increments(
+    a: Sequence[np.ndarray], c: np.ndarray, vector: Callable[[Any, Any], Any], t0: Any, t1: Any, y0: Any, k0: Any
+) -> list[Any]:
+    """kᵢ = h f(t₀ + cᵢ h, y₀ + Σ aᵢⱼ kⱼ) for an explicit tableau; `vector(t, y)` is h f, `k0` the first."""
+    ks = [k0]
+    for row, ci in zip(a, c, strict=True):
+        ti = t1 if ci == 1 else t0 + float(ci) * (t1 - t0)
+        ks.append(vector(ti, combine(row, ks, y0)))
+    return ks
+
+
+class Unrolled(diffrax.AbstractWrappedSolver):
+    """An explicit diffrax Runge–Kutta solver with its stages written out, equal to it up to round-off.
+
+    The wrapped solver's tableau and interpolation are used as they are. `land` is applied to the end of the step before
+    the last stage of a method whose last stage is there, so that the derivative carried to the next step (first same as
+    last) belongs to the point where the step really ended.
+    """
+
+    solver: diffrax.AbstractERK
+
+    @property
+    def term_structure(self) -> Any:
+        return diffrax.ODETerm
+
+    @property
+    def interpolation_cls(self) -> Any:
+        return self.solver.interpolation_cls
+
+    def order(self, terms: Any) -> Any:
+        return self.solver.order(terms)
+
+    def error_order(self, terms: Any) -> Any:
+        return self.solver.error_order(terms)
+
+    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+        return terms.vf(t0, y0, args)
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Any:
+        return terms.vf(t0, y0, args) if self.solver.tableau.fsal else None
+
+    def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any) -> Any:
+        *step, _ = self.landing_step(terms, t0, t1, y0, args, solver_state, made_jump, identity)
+        return *step, diffrax.RESULTS.successful
+
+    def landing_step(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, state: Any, made_jump: Any, land: Callable[..., Any]
+    ) -> Any:
+        """`step`, with its end moved to `land(t1, y1)` → (y1, found)."""
+        tableau = self.solver.tableau
+        control = terms.contr(t0, t1)
+        field = lambda t, y: terms.vf(t, y, args)  # noqa: E731
+        scaled = lambda f: jax.tree.map(lambda x: control * x, f)  # noqa: E731
+        f0 = first_derivative(field, t0, y0, state, made_jump)
+        rows, nodes = tableau.a_lower, tableau.c
+        f1 = None
+        if tableau.fsal:
+            ks = increments(rows[:-1], nodes[:-1], lambda t, y: scaled(field(t, y)), t0, t1, y0, scaled(f0))
+            y1, found = land(t1, combine(rows[-1], ks, y0))
+            f1 = field(t1, y1)
+            ks.append(scaled(f1))
+        else:
+            ks = increments(rows, nodes, lambda t, y: scaled(field(t, y)), t0, t1, y0, scaled(f0))
+            y1, found = land(t1, combine(tableau.b_sol, ks, y0))
+        error = combine(tableau.b_error, ks) if np.any(tableau.b_error) else None
+        dense = {"y0": y0, "y1": y1, "k": jax.tree.map(lambda *k: jnp.stack(k), *ks)}
+        return y1, error, dense, f1, found
+
+
+def first_derivative(field: Callable[..., Any], t0: Any, y0: Any, state: Any, made_jump: Any) -> Any:
+    """f(t₀, y₀), from the last step where that left it."""
+    if state is None or made_jump is True:
+        return field(t0, y0)
+    if made_jump is False:
+        return state
+    return jax.lax.cond(made_jump, lambda: field(t0, y0), lambda: state)
+
+
+def unrolled(solver: diffrax.AbstractSolver) -> diffrax.AbstractSolver:
+    """`solver` with its stages written out where it is an explicit Runge–Kutta method of diffrax, else as it is."""
+    if isinstance(solver, diffrax.AbstractERK) and type(solver).__module__.startswith("diffrax."):
+        return Unrolled(solver)
+    return solver

@@ -1,0 +1,85 @@
+"""Orthogonal projection after each step (Pöll, Hafner and Heinzl, sec. 2.4)."""
+
+from typing import Any
+
+import diffrax
+import jax.numpy as jnp
+
+from .explicit import unrolled
+from .manifold import AbstractManifoldSolver, clock, or_nan, outcome
+
+
+class OrthogonalProjection(diffrax.AbstractWrappedSolver, AbstractManifoldSolver):
+    """A step of `solver`, then the nearest point with H = 0:
+
+        ỹ = Φ_h(y₀),   y₁ = ỹ + N(ỹ) μ,   H(t₁, y₁) = 0,
+
+    with the normals N = M⁻¹Aᵀ in the metric of the mass matrix, taken at ỹ (which is nearest to within the square of
+    the step's error). Positions are projected first, velocities at the new position next. The order of `solver` is
+    kept, and so is its stability and its error estimate; a first integral that `solver` keeps may be lost: with
+    explicit Euler the pendulum's speed grows.
+
+    **Arguments**
+
+    - `solver`: any diffrax solver of ODEs.
+
+    Errors: a projection that is not found makes the step end in NaN: an adaptive controller tries a smaller one, a
+    fixed step ends the solve.
+
+    Source: E. Hairer, C. Lubich, G. Wanner, *Geometric Numerical Integration*, IV.4, algorithm 4.2.
+    """
+
+    solver: diffrax.AbstractSolver
+
+    @property
+    def term_structure(self) -> Any:
+        return self.solver.term_structure
+
+    @property
+    def interpolation_cls(self) -> Any:
+        return self.solver.interpolation_cls
+
+    @property
+    def scan_kind(self) -> Any:
+        return self.solver.scan_kind  # pyright: ignore[reportAttributeAccessIssue]
+
+    @property
+    def root_finder(self) -> Any:
+        return self.solver.root_finder  # pyright: ignore[reportAttributeAccessIssue]
+
+    @property
+    def root_find_max_steps(self) -> Any:
+        return self.solver.root_find_max_steps  # pyright: ignore[reportAttributeAccessIssue]
+
+    def order(self, terms: Any) -> Any:
+        return self.solver.order(terms)
+
+    def error_order(self, terms: Any) -> Any:
+        return self.solver.error_order(terms)
+
+    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+        return self.solver.func(terms, t0, y0, args)
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Any:
+        return unrolled(self.solver).init(terms, t0, t1, y0, args)
+
+    def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any) -> Any:
+        solver = unrolled(self.solver)
+        sign = clock(terms, t0, t1)
+
+        def land(t: Any, y: Any) -> Any:
+            return args.restore(sign * t, y, args.normals(sign * t, y))
+
+        if hasattr(solver, "landing_step"):
+            y1, error, dense, state, found = solver.landing_step(terms, t0, t1, y0, args, solver_state, made_jump, land)
+            result = diffrax.RESULTS.successful
+        else:
+            y1, error, dense, state, result = solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
+            y1, found = land(t1, y1)
+        error = None if error is None else or_nan(found, error)
+        result = diffrax.RESULTS.where(result == diffrax.RESULTS.successful, outcome(jnp.asarray(found)), result)
+        return or_nan(found, y1), error, dense, state, result
+
+    def land(self, t: Any, y: Any, ode: Any) -> Any:
+        y, found = ode.restore(t, y, ode.normals(t, y))
+        return or_nan(found, y)

@@ -1,0 +1,123 @@
+"""Integration in a tangent chart that is built anew at each step: state-space form without a global chart."""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from .explicit import Unrolled, unrolled
+from .manifold import AbstractManifoldSolver, clock, or_nan, outcome
+
+
+class TangentPoint(eqx.Module):
+    """A point of the tangent space at a step's start, with the normals there."""
+
+    y: Any
+    normals: Any
+
+
+class _Interpolation(diffrax.AbstractLocalInterpolation):
+    t0: Any
+    t1: Any
+    inner: Any
+    normals: Any
+    cls: Any = eqx.field(static=True)
+
+    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Any:
+        if t1 is not None:
+            return jax.tree.map(lambda a, b: b - a, self.evaluate(t0), self.evaluate(t1))
+        return TangentPoint(self.cls(t0=self.t0, t1=self.t1, **self.inner).evaluate(t0), self.normals)
+
+
+class TangentSpace(AbstractManifoldSolver, diffrax.AbstractAdaptiveSolver):
+    """A step of an explicit solver in the coordinates of the tangent space at the step's start.
+
+    With the normals N = M⁻¹Aᵀ at y₀ = (q₀, v₀) and the projection P = I − N(AN)⁻¹A along them (orthogonal in the metric
+    of the mass matrix), a point of the manifold near y₀ is u = q₀ + P(q − q₀), w = P v, and
+
+        u̇ = P v,   ẇ = P v̇,   q = u + N ν with g(t, q) = 0,   v = w + N κ with A(q) v + g_t = 0.
+
+    The method works at the stages with points of the manifold only, so that nothing drifts, and needs no global chart.
+    A step that leaves the reach of its chart ends in NaN, which an adaptive controller answers with a smaller step.
+
+    **Arguments**
+
+    - `solver`: an explicit Runge–Kutta solver of diffrax, or `DOP853`.
+
+    Source: F. A. Potra, W. C. Rheinboldt, Mech. Struct. Mach. 19 (1991), 1–18; E. Hairer, C. Lubich, G. Wanner,
+    *Geometric Numerical Integration*, IV.5.
+    """
+
+    solver: diffrax.AbstractSolver
+
+    def __check_init__(self) -> None:
+        if not hasattr(unrolled(self.solver), "landing_step"):
+            raise ValueError(
+                f"TangentSpace takes an explicit Runge–Kutta solver such as diffrax.Tsit5(), but got {self.solver}. "
+                "For an implicit one use OrthogonalProjection."
+            )
+
+    @property
+    def term_structure(self) -> Any:
+        return diffrax.ODETerm
+
+    @property
+    def interpolation_cls(self) -> Any:
+        inner = self.solver.interpolation_cls
+        return lambda t0, t1, inner_info, normals: _Interpolation(t0, t1, inner_info, normals, inner)
+
+    def order(self, terms: Any) -> Any:
+        return self.solver.order(terms)
+
+    def error_order(self, terms: Any) -> Any:
+        return self.solver.error_order(terms)
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Any:
+        return terms.vf(t0, y0, args)
+
+    def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any) -> Any:
+        sign = clock(terms, t0, t1)
+        chart = args.normals(sign * t0, y0)
+        solver = unrolled(self.solver)
+        assert isinstance(solver, Unrolled) or hasattr(solver, "landing_step")
+
+        # The end of the step is the lift of the last stage's point; its derivative is the next step's first.
+        tangent_term = diffrax.ODETerm(lambda t, u, _: _field(terms, sign, args, chart, t, u)[0])
+        first = args.tangent(solver_state, chart) if made_jump is False else None
+        first = tangent_term.vf(t0, y0, None) if first is None else first
+        wrapped = _Controlled(tangent_term, terms)
+        u1, error, dense, _, _ = solver.landing_step(
+            wrapped, t0, t1, y0, None, first, False, lambda t, u: (u, True)
+        )
+        y1, found = args.restore(sign * t1, u1, chart)
+        error = None if error is None else or_nan(found, error)
+        y1 = or_nan(found, y1)
+        info = {"inner_info": dense, "normals": chart}
+        return y1, error, info, terms.vf(t1, y1, args), outcome(found)
+
+    def land(self, t: Any, y: Any, ode: Any) -> Any:
+        if not isinstance(y, TangentPoint):
+            return y
+        y, found = ode.restore(t, y.y, y.normals)
+        return or_nan(found, y)
+
+
+class _Controlled(eqx.Module):
+    """The field in the chart with the step of the outer term."""
+
+    term: diffrax.ODETerm
+    outer: Any
+
+    def vf(self, t: Any, y: Any, args: Any) -> Any:
+        return self.term.vf(t, y, args)
+
+    def contr(self, t0: Any, t1: Any) -> Any:
+        return self.outer.contr(t0, t1)
+
+
+def _field(terms: Any, sign: Any, ode: Any, chart: Any, t: Any, u: Any) -> Any:
+    y, found = ode.restore(sign * t, u, chart)
+    dy = ode.tangent(terms.vf(t, y, ode), chart)
+    return or_nan(jnp.asarray(found), dy), y

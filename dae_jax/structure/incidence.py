@@ -1,0 +1,191 @@
+"""Incidence: which outputs of a JAX function depend on which inputs, entry by entry, read from its jaxpr.
+
+Nothing is sampled. The jaxpr is interpreted once on `Cells`: for each entry of each array either the set of inputs that
+it depends on, or, where it depends on none, its number. Numbers are followed so that a product with a constant zero, a
+constant predicate and a constant index leave exactly the dependences that the function has. Loops are run step by step
+where their length is known.
+
+A primitive without a rule is refused: too many dependences would make a structural analysis report too low an index, as
+surely as too few make it fail.
+"""
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Literal
+
+from . import incidence_contractions as contractions
+from . import incidence_control as control
+from . import incidence_entries as entries
+from . import incidence_indexing as indexing
+from .cells import Cells, as_rows, evaluate, has_extended_dtype
+
+Rule = Callable[[Any, list[Cells]], list[Cells]]
+
+RULES: Mapping[str, Rule] = {
+    **dict.fromkeys(entries.ELEMENTWISE, entries.elementwise),
+    **dict.fromkeys(entries.MOVEMENT, entries.movement),
+    **dict.fromkeys(entries.IDENTITY, lambda eqn, inputs: inputs),
+    **dict.fromkeys(contractions.REDUCTIONS, contractions.reduction),
+    **dict.fromkeys(contractions.CUMULATIVE, contractions.cumulative),
+    **dict.fromkeys([*contractions.DENSE, "fft"], contractions.dense),
+    **dict.fromkeys(contractions.RANDOM, contractions.mixed),
+    **dict.fromkeys(indexing.SCATTERS, indexing.scatter),
+    "concatenate": entries.concatenate,
+    "conv_general_dilated": contractions.convolution,
+    "dot_general": contractions.dot_general,
+    "dynamic_slice": indexing.dynamic_slice,
+    "dynamic_update_slice": indexing.dynamic_update_slice,
+    "gather": indexing.gather,
+    "iota": entries.iota,
+    "pad": entries.pad,
+    "platform_index": lambda eqn, inputs: [Cells.unknown(0, eqn.outvars[0].aval)],
+    "reduce": contractions.general_reduction,
+    "select_n": entries.select_n,
+    "split": entries.split,
+    "stack": entries.stack,
+    "top_k": contractions.top_k,
+    "triangular_solve": contractions.triangular_solve,
+    "unstack": entries.unstack,
+}
+
+# Primitives whose rule runs inner jaxprs.
+CONTROL: Mapping[str, Callable[[Any, list[Cells], control.Run], list[Cells]]] = {
+    "cond": control.cond,
+    "custom_linear_solve": control.linear_solve,
+    "scan": control.scan,
+    "while": control.while_loop,
+}
+
+# Primitives that evaluate another jaxpr, and the parameter that holds it.
+CALLS = {
+    "call": "call_jaxpr",
+    "checkpoint": "jaxpr",
+    "closed_call": "call_jaxpr",
+    "composite": "jaxpr",
+    "core_call": "call_jaxpr",
+    "custom_jvp_call": "call_jaxpr",
+    "custom_vjp_call": "call_jaxpr",
+    "custom_vmap_call": "call",
+    "jit": "jaxpr",
+    "pjit": "jaxpr",
+    "remat2": "jaxpr",
+}
+
+# Cheap on numbers by their own rule; everything else is evaluated as a whole where all its operands are known.
+_CHEAP = frozenset({*entries.ELEMENTWISE, *entries.MOVEMENT, *entries.IDENTITY, *CALLS}) | {
+    "concatenate", "iota", "pad", "platform_index", "select_n", "split", "stack", "unstack",
+}  # fmt: skip
+
+
+def dependence(fn: Callable[..., Any], *example_args: Any, derivative: bool = False) -> list[np.ndarray]:
+    """Which numbers of `fn(*args)` depend on which numbers of each argument.
+
+    `example_args` are pytrees of arrays (or `jax.ShapeDtypeStruct`s), of which shapes and dtypes count, not values.
+    Gives for each argument k a boolean array of shape (outputs, numbers in argument k), where the outputs are all
+    numbers of the result in the order of its leaves, raveled. An argument is not used at all where its array has no
+    `True`.
+
+    `derivative=True` leaves out dependences whose derivative is zero wherever it exists: through comparisons, rounding,
+    `sign`, integers, truth values and `stop_gradient`. It gives the pattern of the Jacobian of `fn`.
+
+    Arrays that `fn` closes over count as constants: a zero among them is a structural zero. Closed over while being
+    traced (an argument of an outer `jit`), they count as unknown numbers that depend on nothing.
+
+    Raises `NotImplementedError` for a primitive without a rule, with its name.
+    """
+    leaves, treedef = jax.tree.flatten(example_args)
+    avals = [_aval(leaf) for leaf in leaves]
+    closed = jax.make_jaxpr(lambda *flat: fn(*jax.tree.unflatten(treedef, flat)))(*avals)
+    sizes = [int(np.prod(aval.shape)) for aval in avals]
+    inputs, start = [], 0
+    for aval, size in zip(avals, sizes, strict=True):
+        bits = np.array([1 << bit for bit in range(start, start + size)], object).reshape(aval.shape)
+        discrete = derivative and not jnp.issubdtype(aval.dtype, jnp.inexact)
+        inputs.append(Cells.unknown(0 if discrete else bits, aval))
+        start += size
+    outputs = _run(closed, inputs, derivative)
+    pattern = as_rows([bits for cells in outputs for bits in cells.dependence.reshape(-1)], start)
+    ends = np.cumsum([sum(jax.tree.leaves(part)) for part in jax.tree.unflatten(treedef, sizes)])
+    return np.split(pattern, ends.astype(int)[:-1], axis=1)
+
+
+def signature(*patterns: np.ndarray) -> list[dict[int, int]]:
+    """For each equation its variables with their highest derivative, from the patterns of shape (equations, variables)
+    with respect to the variables themselves, their first derivatives, their second derivatives, and so on."""
+    rows: list[dict[int, int]] = [{} for _ in range(patterns[0].shape[0])]
+    for order, pattern in enumerate(patterns):
+        for equation, variable in np.argwhere(pattern):
+            rows[int(equation)][int(variable)] = order
+    return rows
+
+
+def _run(closed: ClosedJaxpr, inputs: Sequence[Cells], derivative: bool) -> list[Cells]:
+    """The outputs of a jaxpr on `inputs`."""
+    jaxpr = closed.jaxpr
+    env: dict[Any, Cells] = dict(zip(jaxpr.invars, inputs, strict=True))
+    for variable, const in zip(jaxpr.constvars, closed.consts, strict=True):
+        env[variable] = _constant(const, variable.aval)
+    for eqn in jaxpr.eqns:
+        if eqn.outvars:
+            outputs = _run_eqn(eqn, [_read(env, atom) for atom in eqn.invars], derivative)
+            env.update(zip(eqn.outvars, outputs, strict=True))
+    return [_read(env, atom) for atom in jaxpr.outvars]
+
+
+def _run_eqn(eqn: Any, inputs: list[Cells], derivative: bool) -> list[Cells]:
+    """The outputs of one equation of a jaxpr: numbers where the operands are, else by its rule."""
+    name = eqn.primitive.name
+    if name not in _CHEAP and not eqn.effects and all(cells.known.all() for cells in inputs):
+        numbers = evaluate(eqn, [cells.value for cells in inputs])
+        return [_constant(number, out.aval) for number, out in zip(numbers, eqn.outvars, strict=True)]
+    run = functools.partial(_run, derivative=derivative)
+    if name in CALLS:
+        inner = eqn.params[CALLS[name]]
+        outputs = run(inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ()), inputs)
+    elif name in CONTROL:
+        outputs = CONTROL[name](eqn, inputs, run)
+    elif name == "sort":
+        outputs = contractions.sort(eqn, inputs, with_order=not derivative)
+    elif name in RULES:
+        outputs = RULES[name](eqn, inputs)
+    else:
+        raise NotImplementedError(
+            f"How the outputs of the primitive `{name}` depend on its inputs is not known. "
+            "Write this part of the function with other operations."
+        )
+    for cells, out in zip(outputs, eqn.outvars, strict=True):
+        if cells.shape != out.aval.shape:
+            raise AssertionError(f"The rule of `{name}` gave shape {cells.shape}, not {out.aval.shape}.")
+    if derivative:
+        return [_smooth(cells, out.aval, name) for cells, out in zip(outputs, eqn.outvars, strict=True)]
+    return outputs
+
+
+def _smooth(cells: Cells, aval: Any, name: str) -> Cells:
+    """Without the dependences whose derivative is zero."""
+    if name in entries.FLAT or not jnp.issubdtype(aval.dtype, jnp.inexact):
+        return Cells(np.zeros(cells.shape, object), cells.known, cells.value)
+    return cells
+
+
+def _read(env: Mapping[Any, Cells], atom: Any) -> Cells:
+    return _constant(atom.val, atom.aval) if isinstance(atom, Literal) else env[atom]
+
+
+def _constant(value: Any, aval: Any) -> Cells:
+    """A constant of a jaxpr: known unless it is traced itself or no number."""
+    if isinstance(value, jax.core.Tracer) or has_extended_dtype(aval):
+        return Cells.unknown(0, aval)
+    return Cells.constant(np.asarray(value, aval.dtype))
+
+
+def _aval(leaf: Any) -> Any:
+    if isinstance(leaf, jax.ShapeDtypeStruct):
+        return leaf
+    aval = jax.typeof(leaf)
+    return jax.ShapeDtypeStruct(aval.shape, aval.dtype, weak_type=aval.weak_type)

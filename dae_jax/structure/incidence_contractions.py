@@ -1,0 +1,216 @@
+"""Dependence rules of primitives in which an entry comes from many: sums, products of matrices, linear algebra."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from .cells import Cells, as_sets, evaluate, union, unless
+
+REDUCTIONS = frozenset(
+    [
+        "argmax",
+        "argmin",
+        "reduce_and",
+        "reduce_max",
+        "reduce_min",
+        "reduce_or",
+        "reduce_prod",
+        "reduce_sum",
+        "reduce_xor",
+    ]
+)
+CUMULATIVE = frozenset(["cumlogsumexp", "cummax", "cummin", "cumprod", "cumsum"])
+
+# Random numbers: every entry comes from the whole key.
+RANDOM = frozenset(
+    ["random_bits", "random_fold_in", "random_seed", "random_split", "random_unwrap", "random_wrap", "threefry2x32"]
+)
+
+# Every entry of a result depends on every entry of the operands that has the same leading indices: the number of
+# trailing axes of the first operand that are mixed so.
+DENSE = {
+    "cholesky": 2,
+    "cholesky_update": 2,
+    "eig": 2,
+    "eigh": 2,
+    "geqp3": 2,
+    "geqrf": 2,
+    "hessenberg": 2,
+    "householder_product": 2,
+    "lu": 2,
+    "lu_pivots_to_permutation": 1,
+    "ormqr": 2,
+    "qr": 2,
+    "schur": 2,
+    "svd": 2,
+    "tridiagonal": 2,
+    "tridiagonal_solve": 1,
+}
+
+
+def dense(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+    """Linear algebra and Fourier transforms, matrix by matrix."""
+    name = eqn.primitive.name
+    batch = inputs[0].dependence.ndim - (len(eqn.params["fft_lengths"]) if name == "fft" else DENSE[name])
+    total = np.zeros((), object)
+    for cells in inputs:
+        total = total | union(cells.dependence, tuple(range(batch, cells.dependence.ndim)))
+    total = as_sets(total)
+    return [
+        Cells.unknown(total.reshape(total.shape + (1,) * (len(out.aval.shape) - batch)), out.aval)
+        for out in eqn.outvars
+    ]
+
+
+def mixed(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+    """Every entry depends on all entries of all operands."""
+    total = 0
+    for cells in inputs:
+        total |= union(cells.dependence, tuple(range(cells.dependence.ndim)))[()]
+    return [Cells.unknown(total, out.aval) for out in eqn.outvars]
+
+
+def reduction(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+    """Sums, products, extrema along axes. A product with a known 0 is 0."""
+    (operand,), axes = inputs, tuple(eqn.params["axes"])
+    known = operand.known.all(axes)
+    if eqn.primitive.name == "reduce_prod":
+        known = known | ~operand.nonzero.all(axes)
+    return [_finish(eqn, inputs, union(operand.dependence, axes), known)]
+
+
+def cumulative(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+    """Cumulative sums, products and extrema along an axis."""
+    (operand,), axis = inputs, eqn.params["axis"]
+
+    def accumulate(ufunc: np.ufunc, a: np.ndarray) -> np.ndarray:
+        if eqn.params["reverse"]:
+            return np.flip(ufunc.accumulate(np.flip(a, axis), axis), axis)
+        return ufunc.accumulate(a, axis)
+
+    dependence = accumulate(np.bitwise_or, operand.dependence)
+    return [_finish(eqn, inputs, dependence, accumulate(np.logical_and, operand.known))]
+
+
+def general_reduction(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+    """`lax.reduce` with any function: each result depends on all operands along the axes."""
+    axes, half = tuple(eqn.params["dimensions"]), len(inputs) // 2
+    total = np.zeros((), object)
+    for operand, start in zip(inputs[:half], inputs[half:], strict=True):
+        total = total | union(operand.dependence, axes) | start.dependence
+    return [Cells.unknown(total, out.aval) for out in eqn.outvars]
+
+
+def dot_general(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+    """Sums of products a_bmk c_bkn; a term with a known 0 adds nothing."""
+    (a_sum, c_sum), (a_batch, c_batch) = eqn.params["dimension_numbers"]
+    a = inputs[0].map(lambda x: _as_batch_matrix(x, a_batch, a_sum))
+    c = inputs[1].map(lambda x: _as_batch_matrix(x, c_batch, c_sum))
+    a_nonzero, c_nonzero = a.nonzero, c.nonzero
+    dependence = np.zeros((a.shape[0], a.shape[1], c.shape[1]), object)
+    for b, k in np.ndindex(a.shape[0], a.shape[2]):
+        rows, columns = np.flatnonzero(a_nonzero[b, :, k]), np.flatnonzero(c_nonzero[b, :, k])
+        if rows.size and columns.size:
+            terms = a.dependence[b][rows, k][:, None] | c.dependence[b][columns, k]
+            dependence[b][np.ix_(rows, columns)] |= terms
+    open_terms = _batch_product(a_nonzero, c_nonzero) - _batch_product(a_nonzero & a.known, c_nonzero & c.known)
+    shape = eqn.outvars[0].aval.shape
+    return [_finish(eqn, inputs, dependence.reshape(shape), (open_terms == 0).reshape(shape))]
+
+
+def convolution(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+    """Sums of products of image and kernel; a term with a known 0 adds nothing.
+
+    The image entry that meets a kernel entry is found by convolving an image of positions with that entry alone.
+    """
+    image, kernel = inputs
+    aval = eqn.outvars[0].aval
+    places = np.arange(1, image.dependence.size + 1, dtype=np.float32).reshape(image.shape)
+    flat_dependence, flat_known = image.dependence.reshape(-1), image.known.reshape(-1)
+    flat_nonzero = image.nonzero.reshape(-1)
+    dependence, known = np.zeros(aval.shape, object), np.ones(aval.shape, bool)
+    for tap in np.argwhere(kernel.nonzero):
+        tap = tuple(tap)
+        alone = np.zeros(kernel.shape, np.float32)
+        alone[tap] = 1
+        place = np.asarray(evaluate(_with_dtype(eqn, np.float32), [places, alone])[0]).round().astype(int) - 1
+        meets = (place >= 0) & flat_nonzero[place]
+        dependence = dependence | unless(~meets, flat_dependence[place] | kernel.dependence[tap])
+        known &= ~meets | (flat_known[place] & kernel.known[tap])
+    return [_finish(eqn, inputs, dependence, known)]
+
+
+def triangular_solve(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+    """Substitution, row by row: the pattern of the triangle is kept."""
+    p, (a, b) = eqn.params, inputs
+    lower = p["lower"]
+    if p["transpose_a"] == p["left_side"]:  # x A = b is Aᵀ xᵀ = bᵀ
+        a, lower = a.map(lambda x: x.swapaxes(-1, -2)), not lower
+    if not p["left_side"]:
+        b = b.map(lambda x: x.swapaxes(-1, -2))
+    n = a.shape[-1]
+    a_nonzero = a.nonzero
+    x, nonzero = b.dependence.copy(), b.nonzero.copy()
+    order = range(n) if lower else range(n - 1, -1, -1)
+    for batch in np.ndindex(a.shape[:-2]):
+        for position, i in enumerate(order):
+            for j in order[:position]:
+                if a_nonzero[(*batch, i, j)]:
+                    there = nonzero[(*batch, j)]
+                    x[(*batch, i)] |= unless(~there, x[(*batch, j)] | a.dependence[(*batch, i, j)])
+                    nonzero[(*batch, i)] |= there
+            pivot = 0 if p["unit_diagonal"] else a.dependence[(*batch, i, i)]
+            x[(*batch, i)] = unless(~nonzero[(*batch, i)], x[(*batch, i)] | pivot)
+    result = Cells(x, ~nonzero, np.zeros(x.shape, b.value.dtype))
+    return [result if p["left_side"] else result.map(lambda x: x.swapaxes(-1, -2))]
+
+
+def sort(eqn: Any, inputs: list[Cells], with_order: bool) -> list[Cells]:
+    """Operands put in the order of their keys: every entry along the axis may end up anywhere.
+
+    `with_order`: whether a result also depends on the keys that order it.
+    """
+    axis, keys = eqn.params["dimension"], inputs[: eqn.params["num_keys"]]
+    order = np.zeros((), object)
+    for key in keys if with_order else []:
+        order = order | key.dependence
+    return [
+        Cells.unknown(union(cells.dependence | order, (axis,), keepdims=True), out.aval)
+        for cells, out in zip(inputs, eqn.outvars, strict=True)
+    ]
+
+
+def top_k(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+    """The largest entries along an axis, and where they are."""
+    axis = eqn.params.get("axis", -1) % len(inputs[0].shape)
+    total = union(inputs[0].dependence, (axis,), keepdims=True)
+    return [Cells.unknown(total, out.aval) for out in eqn.outvars]
+
+
+def _finish(eqn: Any, inputs: list[Cells], dependence: Any, known: Any) -> Cells:
+    """The result, with its known entries computed from the operands, 0 in place of what is not known."""
+    aval = eqn.outvars[0].aval
+    known = np.asarray(known)
+    if not known.any():
+        return Cells.unknown(dependence, aval)
+    values = [np.where(cells.known, cells.value, np.zeros((), cells.value.dtype)) for cells in inputs]
+    return Cells(unless(known, dependence), known, evaluate(eqn, values)[0])
+
+
+def _as_batch_matrix(array: np.ndarray, batch: Any, summed: Any) -> np.ndarray:
+    """The array with axes (batch, free, summed)."""
+    free = [axis for axis in range(array.ndim) if axis not in {*batch, *summed}]
+    sizes = [int(np.prod([array.shape[axis] for axis in axes])) for axes in (batch, free, summed)]
+    return array.transpose([*batch, *free, *summed]).reshape(sizes)
+
+
+def _batch_product(a: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """How many k have both a_bmk and c_bnk."""
+    return np.matmul(a.astype(np.float32), c.astype(np.float32).swapaxes(-1, -2))
+
+
+def _with_dtype(eqn: Any, dtype: Any) -> Any:
+    """The equation with another dtype of its result."""
+    params = eqn.params | {"preferred_element_type": jnp.dtype(dtype)}
+    return eqn.replace(params=params)

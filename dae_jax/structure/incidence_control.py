@@ -1,0 +1,147 @@
+"""Dependence rules of branches, loops and implicitly given linear solves: what runs other jaxprs."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from jax.extend.core import ClosedJaxpr
+
+from .blocks import block_triangular
+from .cells import Cells, as_rows, union
+from .incidence_entries import together
+from .matching import maximum_matching
+
+# Loops of more steps than this are summarised by a fixed point.
+LONGEST_LOOP = 10_000
+
+Run = Callable[[ClosedJaxpr, Sequence[Cells]], list[Cells]]
+
+
+def cond(eqn: Any, inputs: list[Cells], run: Run) -> list[Cells]:
+    """The branch, if it is known; else any branch, and what the choice depends on."""
+    choice, *operands = inputs
+    branches = eqn.params["branches"]
+    if choice.known:
+        return run(branches[min(max(int(choice.value), 0), len(branches) - 1)], operands)
+    either, *others = (run(branch, operands) for branch in branches)
+    for other in others:
+        either = [a.join(b) for a, b in zip(either, other, strict=True)]
+    return [cells.also(choice.dependence) for cells in either]
+
+
+def scan(eqn: Any, inputs: list[Cells], run: Run) -> list[Cells]:
+    """Step by step; a loop of more than `LONGEST_LOOP` steps as one step repeated any number of times."""
+    p = eqn.params
+    n_consts, n_carry, length = p["num_consts"], p["num_carry"], p["length"]
+    consts, carry, xs = inputs[:n_consts], inputs[n_consts : n_consts + n_carry], inputs[n_consts + n_carry :]
+    if length > LONGEST_LOOP:
+        return _long_scan(eqn, consts, carry, xs, run)
+    rows: list[list[Cells]] = []
+    for step in reversed(range(length)) if p["reverse"] else range(length):
+        now = [x.map(lambda a, step=step: a[step, ...]) for x in xs]
+        outputs = run(p["jaxpr"], [*consts, *carry, *now])
+        carry = outputs[:n_carry]
+        rows.append(outputs[n_carry:])
+    if not rows:
+        return [*carry, *(Cells.unknown(0, out.aval) for out in eqn.outvars[n_carry:])]
+    ys = zip(*(rows[::-1] if p["reverse"] else rows), strict=True)
+    return [*carry, *(together(np.stack, list(y)) for y in ys)]
+
+
+def _long_scan(eqn: Any, consts: list[Cells], carry: list[Cells], xs: list[Cells], run: Run) -> list[Cells]:
+    """A scan in which every step may see any entry of `xs`, after any number of steps."""
+    body, n_carry = eqn.params["jaxpr"], len(carry)
+    avals = [variable.aval for variable in body.jaxpr.invars[len(consts) + n_carry :]]
+    any_x = [Cells.unknown(union(x.dependence, (0,)), aval) for x, aval in zip(xs, avals, strict=True)]
+    carry = _repeat(lambda state: run(body, [*consts, *state, *any_x])[:n_carry], carry)
+    ys = run(body, [*consts, *carry, *any_x])[n_carry:]
+    outs = eqn.outvars[n_carry:]
+    return [*carry, *(Cells.unknown(y.dependence, out.aval) for y, out in zip(ys, outs, strict=True))]
+
+
+def while_loop(eqn: Any, inputs: list[Cells], run: Run) -> list[Cells]:
+    """Step by step while the condition is known; from then on any number of steps, and what decides it."""
+    p = eqn.params
+    n_cond, n_body = p["cond_nconsts"], p["body_nconsts"]
+    cond_consts, body_consts, state = inputs[:n_cond], inputs[n_cond : n_cond + n_body], inputs[n_cond + n_body :]
+    for _ in range(LONGEST_LOOP):
+        goes_on = run(p["cond_jaxpr"], [*cond_consts, *state])[0]
+        if not goes_on.known:
+            break
+        if not goes_on.value:
+            return state
+        state = run(p["body_jaxpr"], [*body_consts, *state])
+    body = p["body_jaxpr"].jaxpr
+    kept = [out is old for out, old in zip(body.outvars, body.invars[n_body:], strict=True)]
+
+    def step(state: list[Cells]) -> list[Cells]:
+        decided_by = run(p["cond_jaxpr"], [*cond_consts, *state])[0].dependence
+        after = run(p["body_jaxpr"], [*body_consts, *state])
+        return [cells if same else cells.also(decided_by) for cells, same in zip(after, kept, strict=True)]
+
+    return _repeat(step, state)
+
+
+def _repeat(step: Callable[[list[Cells]], list[Cells]], state: list[Cells]) -> list[Cells]:
+    """What `state` may be after any number of steps."""
+    while True:
+        after = step(state)
+        if all(new.within(old) for new, old in zip(after, state, strict=True)):
+            return state
+        state = [old.join(new) for old, new in zip(state, after, strict=True)]
+
+
+def linear_solve(eqn: Any, inputs: list[Cells], run: Run) -> list[Cells]:
+    """A x = b, given by the function x ↦ A x: the pattern of A⁻¹ by blocks, whatever algorithm solves it.
+
+    Row i of A x is run with a bit of its own for each unknown, which gives the unknowns in equation i beside what its
+    coefficients depend on. In block triangular order a block's unknowns depend on all that its equations depend on and
+    on the unknowns found before.
+    """
+    lengths = eqn.params["const_lengths"]
+    right, avals = inputs[sum(lengths) :], [out.aval for out in eqn.outvars]
+    first = max(int(bits).bit_length() for cells in inputs for bits in [*cells.dependence.reshape(-1), 0])
+    ends = np.cumsum([0, *(cells.dependence.size for cells in right)]).tolist()
+    n = ends[-1]
+
+    def shaped(entries: np.ndarray) -> list[Cells]:
+        return [
+            Cells.unknown(entries[low:high].reshape(aval.shape), aval)
+            for low, high, aval in zip(ends[:-1], ends[1:], avals, strict=True)
+        ]
+
+    unknowns = shaped(np.array([1 << bit for bit in range(first, first + n)], object))
+    left = _flat(run(eqn.params["jaxprs"].matvec, [*inputs[: lengths.matvec], *unknowns]))
+    rows = [np.flatnonzero(row).tolist() for row in as_rows([bits >> first for bits in left], n)]
+    own = [(a & ((1 << first) - 1)) | b for a, b in zip(left, _flat(right), strict=True)]
+    nonzero = [bool(entry) for part in right for entry in part.nonzero.reshape(-1)]
+    return shaped(np.array(_solve_blocks(rows, own, nonzero), object))
+
+
+def _solve_blocks(rows: list[list[int]], own: list[int], nonzero: list[bool]) -> list[int]:
+    """What each unknown depends on, of equations with the given unknowns, own dependences and right-hand sides.
+
+    A block without a right-hand side, its own or from the blocks before, is solved by 0.
+    """
+    matching = [variable for variable in maximum_matching(rows, len(rows)) if variable is not None]
+    everything = 0
+    for bits in own:
+        everything |= bits
+    found = [everything] * len(rows)
+    if len(matching) < len(rows):
+        return found
+    moves = [False] * len(rows)
+    for block in block_triangular(rows, matching):
+        before = {variable for equation in block.equations for variable in rows[equation]} - {*block.variables}
+        before = {variable for variable in before if moves[variable]}
+        moving = bool(before) or any(nonzero[equation] for equation in block.equations)
+        total = 0
+        for bits in [*(own[equation] for equation in block.equations), *(found[variable] for variable in before)]:
+            total |= bits if moving else 0
+        for variable in block.variables:
+            found[variable], moves[variable] = total, moving
+    return found
+
+
+def _flat(cells: list[Cells]) -> list[int]:
+    return [bits for part in cells for bits in part.dependence.reshape(-1)]

@@ -1,0 +1,67 @@
+"""What the equations are: the systems that a user writes down as plain JAX functions."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+
+class ConstrainedSystem(eqx.Module):
+    """A constrained mechanical system in redundant coordinates,
+
+        q̇ = v,
+        M v̇ = f(t, q, v) − Gᵀ λ − Hᵀ μ,        G = ∂g/∂q,  H = ∂h/∂v,
+        0 = g(t, q),                            (holonomic, m equations)
+        0 = h(t, q, v),                         (nonholonomic, p equations)
+
+    a differential-algebraic system of index 3 (index 2 where there is no g).
+
+    Functions take the user's `args` last. `q` and `v` are any pytree of arrays, of the same structure; they hold
+    `n` numbers in all. Every function follows that structure; `constraint` and `nonholonomic` return a scalar or a
+    vector.
+
+    **Arguments**
+
+    - `force(t, q, v, args)`: the applied forces, with the structure of `q`. Where M depends on q, the Coriolis and
+      centrifugal terms belong here too.
+    - `constraint(t, q, args)`: g. It may depend on time. `None` for a purely nonholonomic system.
+    - `mass`: `None` (unit masses), a vector of `n` masses (also with the structure of `q`), an `(n, n)` symmetric
+      positive definite matrix, or a function `(q, args) → (n, n)` matrix.
+    - `nonholonomic(t, q, v, args)`: h, constraints at velocity level (rolling, knife edge).
+    - `potential(q, args)`: the potential energy; used by `energy` alone.
+    - `rank`: how many of the m + p constraints are independent, where some are redundant. `daesolve` finds it at the
+      initial state where that is concrete; say it here where the initial state is traced (`jit`, `vmap`).
+
+    Source: E. Hairer, G. Wanner, *Solving Ordinary Differential Equations II*, eq. VII.1.46.
+    """
+
+    force: Callable[..., Any]
+    constraint: Callable[..., Any] | None = None
+    mass: Any = None
+    nonholonomic: Callable[..., Any] | None = None
+    potential: Callable[..., Any] | None = None
+    rank: int | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self) -> None:
+        for name in ("force", "constraint", "nonholonomic", "potential"):
+            function = getattr(self, name)
+            if not callable(function) and not (function is None and name != "force"):
+                raise TypeError(f"`{name}` must be a function, but is {function!r}.")
+        if self.constraint is None and self.nonholonomic is None:
+            raise TypeError(
+                "A ConstrainedSystem needs a `constraint` or a `nonholonomic` constraint; "
+                "without either it is an ODE, which `diffrax.diffeqsolve` solves."
+            )
+
+    def mass_matrix(self, q: Any, args: Any = None) -> Float[Array, "n n"] | Float[Array, " n"] | None:
+        """M at `q`: `None` for unit masses, a vector if diagonal, else a matrix."""
+        mass = self.mass(q, args) if callable(self.mass) else self.mass
+        if mass is None:
+            return None
+        if isinstance(mass, jax.Array | np.ndarray | float | int):
+            return jnp.asarray(mass)
+        return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(mass)])

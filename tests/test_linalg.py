@@ -1,0 +1,207 @@
+"""Linear and nonlinear equations against numpy and closed forms."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dae_jax.linalg import newton, semidefinite_solve, solve
+from dae_jax.linalg.semidefinite import LOOPED, UNROLLED
+
+
+# Straight-line code, a loop over columns, LAPACK.
+SIZES = [1, 3, UNROLLED, UNROLLED + 1, 20, LOOPED, LOOPED + 1]
+ONE_OF_EACH = [4, UNROLLED + 2, LOOPED + 1]
+
+
+def definite(m, seed=0):
+    A = np.random.default_rng(seed).normal(size=(m, m))
+    return A @ A.T + m * np.eye(m)
+
+
+def semidefinite(m, rank, seed=0):
+    A = np.random.default_rng(seed).normal(size=(m, rank))
+    return A @ A.T
+
+
+def right(*shape, seed=1):
+    return np.random.default_rng(seed).normal(size=shape)
+
+
+def directional(fn, args, directions, h=1e-6):
+    """The derivative of a numpy function by central differences."""
+    ahead = fn(*(a + h * d for a, d in zip(args, directions, strict=True)))
+    behind = fn(*(a - h * d for a, d in zip(args, directions, strict=True)))
+    return (ahead - behind) / (2 * h)
+
+
+class TestSemidefiniteSolve:
+    @pytest.mark.parametrize("columns", [(), (3,)], ids=["vector", "matrix"])
+    @pytest.mark.parametrize("m", SIZES)
+    def test_equals_numpy(self, m, columns):
+        S, b = definite(m), right(m, *columns)
+        x = semidefinite_solve(jnp.array(S), jnp.array(b))
+        np.testing.assert_allclose(x, np.linalg.solve(S, b), rtol=1e-11, atol=1e-15)
+
+    def test_follows_the_dtype(self):
+        S, b = jnp.array(definite(4), jnp.float32), jnp.array(right(4), jnp.float32)
+        x = semidefinite_solve(S, b)
+        assert x.dtype == jnp.float32
+        np.testing.assert_allclose(S @ x, b, rtol=1e-5, atol=1e-5)
+
+    @pytest.mark.parametrize("m", [2, UNROLLED, UNROLLED + 2, LOOPED])
+    def test_singular_without_rank_is_nan(self, m):
+        x = semidefinite_solve(jnp.array(semidefinite(m, m - 1)), jnp.array(right(m)))
+        assert np.isnan(x).any()
+
+    @pytest.mark.parametrize("m", [3, UNROLLED + 2, LOOPED + 1])
+    def test_indefinite_is_nan(self, m):
+        S = definite(m)
+        S[m - 1, m - 1] = -1.0
+        assert np.isnan(semidefinite_solve(jnp.array(S), jnp.array(right(m)))).any()
+
+    @pytest.mark.parametrize("columns", [(), (2,)], ids=["vector", "matrix"])
+    @pytest.mark.parametrize(("m", "rank"), [(3, 1), (5, 3), (8, 7), (14, 10)])
+    def test_minimum_norm(self, m, rank, columns):
+        S, b = semidefinite(m, rank), right(m, *columns)
+        expected = np.linalg.lstsq(S, b, rcond=1e-10)[0]
+        np.testing.assert_allclose(
+            semidefinite_solve(jnp.array(S), jnp.array(b), rank), expected, rtol=1e-7, atol=1e-8 * abs(expected).max()
+        )
+
+    def test_rank_zero_and_full(self):
+        S, b = jnp.array(definite(3)), jnp.array(right(3))
+        np.testing.assert_array_equal(semidefinite_solve(0 * S, b, 0), np.zeros(3))
+        np.testing.assert_array_equal(semidefinite_solve(S, b, 3), semidefinite_solve(S, b))
+
+    @pytest.mark.parametrize("m", ONE_OF_EACH)
+    def test_derivatives(self, m):
+        S, b, dS, db, w = definite(m), right(m), definite(m, 5), right(m, seed=6), right(m, seed=7)
+        expected = directional(np.linalg.solve, (S, b), (dS, db))
+        args = (jnp.array(S), jnp.array(b))
+        _, forward = jax.jvp(semidefinite_solve, args, (jnp.array(dS), jnp.array(db)))
+        np.testing.assert_allclose(forward, expected, rtol=1e-6, atol=1e-8)
+        _, pullback = jax.vjp(semidefinite_solve, *args)
+        gS, gb = pullback(jnp.array(w))
+        np.testing.assert_allclose(np.sum(gS * dS) + gb @ db, w @ expected, rtol=1e-6)
+
+    def test_derivative_of_the_minimum_norm(self):
+        A, dA, b = right(5, 3), right(5, 3, seed=8), right(5)
+
+        def numpy_solve(A):
+            return np.linalg.lstsq(A @ A.T, b, rcond=1e-10)[0]
+
+        _, forward = jax.jvp(lambda A: semidefinite_solve(A @ A.T, jnp.array(b), 3), (jnp.array(A),), (jnp.array(dA),))
+        np.testing.assert_allclose(forward, directional(numpy_solve, (A,), (dA,)), rtol=1e-5, atol=1e-6)
+
+    @pytest.mark.parametrize("m", ONE_OF_EACH)
+    def test_vmap(self, m):
+        S, b = np.stack([definite(m, i) for i in range(3)]), right(3, m)
+        result = jax.vmap(semidefinite_solve)(jnp.array(S), jnp.array(b))
+        np.testing.assert_allclose(result, np.linalg.solve(S, b[..., None])[..., 0], rtol=1e-11)
+
+
+class TestSolve:
+    @pytest.mark.parametrize("n", [1, 2, 5, 32, 33])
+    def test_equals_numpy(self, n):
+        A, b = right(n, n), right(n, seed=2)
+        np.testing.assert_allclose(solve(jnp.array(A), jnp.array(b)), np.linalg.solve(A, b), rtol=1e-9)
+
+    @pytest.mark.parametrize("tiny", [0.0, 1e-20])
+    def test_pivots(self, tiny):
+        A, b = np.array([[tiny, 2.0, 1.0], [1.0, tiny, 3.0], [4.0, 1.0, tiny]]), np.array([1.0, 2.0, 3.0])
+        np.testing.assert_allclose(solve(jnp.array(A), jnp.array(b)), np.linalg.solve(A, b), rtol=1e-14)
+
+    def test_singular_is_not_finite(self):
+        assert not np.isfinite(solve(jnp.array([[1.0, 2.0], [2.0, 4.0]]), jnp.array([1.0, 1.0]))).all()
+
+    @pytest.mark.parametrize("n", [4, 33])
+    def test_derivatives(self, n):
+        A, b, dA, db, w = right(n, n) + n * np.eye(n), right(n, seed=2), right(n, n, seed=3), right(n, seed=4), right(n)
+        expected = directional(np.linalg.solve, (A, b), (dA, db))
+        args = (jnp.array(A), jnp.array(b))
+        np.testing.assert_allclose(
+            jax.jvp(solve, args, (jnp.array(dA), jnp.array(db)))[1], expected, rtol=1e-6, atol=1e-9
+        )
+        gA, gb = jax.vjp(solve, *args)[1](jnp.array(w))
+        np.testing.assert_allclose(np.sum(gA * dA) + gb @ db, w @ expected, rtol=1e-6)
+
+    def test_vmap(self):
+        A, b = right(5, 4, 4), right(5, 4, seed=2)
+        expected = np.linalg.solve(A, b[..., None])[..., 0]
+        np.testing.assert_allclose(jax.vmap(solve)(jnp.array(A), jnp.array(b)), expected, rtol=1e-10)
+
+
+def circle_and_line(x, p):
+    """x² + y² = p², y = x: the root is (p, p)/√2."""
+    return jnp.stack([x @ x - p**2, x[1] - x[0]])
+
+
+def cube(x, p):
+    return x**3 - p
+
+
+class TestNewton:
+    def test_converges_to_roundoff(self):
+        x, converged = newton(circle_and_line, jnp.array([1.0, 0.5]), jnp.array(2.0))
+        assert converged
+        np.testing.assert_allclose(x, np.sqrt([2.0, 2.0]), rtol=1e-15)
+
+    def test_from_the_root_itself(self):
+        x, converged = newton(cube, jnp.array([2.0]), jnp.array(8.0))
+        assert converged
+        assert x[0] == 2.0
+
+    @pytest.mark.parametrize(
+        ("residual", "x0"),
+        [
+            (lambda x, p: x**2 + p, 0.7),  # no root
+            (lambda x, p: 0 * x + p, 1.0),  # no Jacobian
+            (lambda x, p: p + jnp.sqrt(x), 0.5),  # leaves the domain
+        ],
+    )
+    def test_reports_failure(self, residual, x0):
+        _, converged = newton(residual, jnp.array([x0]), jnp.array(1.0))
+        assert not converged
+
+    def test_reports_too_few_steps(self):
+        assert not newton(cube, jnp.array([50.0]), jnp.array(8.0), max_steps=3)[1]
+
+    def test_first_and_second_derivatives(self):
+        def root(p):
+            return newton(cube, jnp.array([1.5]), p)[0][0]
+
+        p = jnp.array(3.0)
+        first, second = 3 ** (-2 / 3) / 3, -2 / 9 * 3 ** (-5 / 3)
+        np.testing.assert_allclose(jax.jvp(root, (p,), (jnp.array(1.0),))[1], first, rtol=1e-14)
+        np.testing.assert_allclose(jax.grad(root)(p), first, rtol=1e-14)
+        for outer in (jax.jacfwd, jax.jacrev):
+            for inner in (jax.jacfwd, jax.jacrev):
+                np.testing.assert_allclose(outer(inner(root))(p), second, rtol=1e-13)
+
+    def test_derivative_of_several_unknowns_and_a_pytree(self):
+        def residual(x, params):
+            return circle_and_line(x, params["radius"]) * params["scale"]
+
+        def root(radius, scale):
+            return newton(residual, jnp.array([1.0, 0.5]), {"radius": radius, "scale": scale, "name": "circle"})[0]
+
+        by_radius, by_scale = jax.jacrev(root, argnums=(0, 1))(jnp.array(2.0), jnp.array(3.0))
+        np.testing.assert_allclose(by_radius, np.sqrt([0.5, 0.5]), rtol=1e-14)
+        np.testing.assert_allclose(by_scale, np.zeros(2), atol=1e-14)
+
+    @pytest.mark.parametrize("transform", [lambda f: f, jax.jit], ids=["eager", "jit"])
+    @pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd])
+    def test_start_has_no_derivative(self, derivative, transform):
+        def root(x0, p):
+            return newton(cube, x0[None], p)[0][0]
+
+        by_start, by_p = derivative(transform(root), argnums=(0, 1))(1.5, 3.0)
+        assert by_start == 0
+        np.testing.assert_allclose(by_p, 3 ** (-2 / 3) / 3, rtol=1e-14)
+
+    def test_vmap(self):
+        p = jnp.array([1.0, 8.0, 27.0])
+        x, converged = jax.vmap(lambda p: newton(cube, jnp.array([2.5]), p))(p)
+        assert converged.all()
+        np.testing.assert_allclose(x[:, 0], [1.0, 2.0, 3.0], rtol=1e-14)
