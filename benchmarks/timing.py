@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
 
+
 RESULTS = Path(__file__).parent / "results"
 
 

@@ -9,7 +9,7 @@ from .formulations import (
 )
 from .initialise import consistent_state as consistent_state
 from .kernels import configure as configure
-from .solution import DAESolution as DAESolution, RESULTS as RESULTS
+from .solution import RESULTS as RESULTS, DAESolution as DAESolution
 from .solve import daesolve as daesolve
 from .solvers import (
     DOP853 as DOP853,

@@ -53,7 +53,8 @@ class ManifoldODE(eqx.Module):
     @abc.abstractmethod
     def field(self, t: Any, y: Any, feedback: Any = None) -> Any:
         """The underlying ODE at (t, y). `feedback`, a function of H and its derivatives level by level, is added to the
-        highest derivative of each constraint, which is 0 otherwise (see `Baumgarte`)."""
+        highest derivative of each constraint, which is 0 otherwise (see `Baumgarte`).
+        """
 
     @abc.abstractmethod
     def invariants(self, t: Any, y: Any) -> tuple[Float[Array, " levels"], ...]:
@@ -165,9 +166,7 @@ class MechanicalODE(ManifoldODE):
     def bias(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " mp"]:
         """γ, the second derivative of g and the first of h where v̇ = 0."""
         uses_time = self.depends_on_time[0] or self.depends_on_time[1]
-        _, bias = self._along(
-            lambda t, q: self.velocity_constraint(t, q, v), uses_time, t, (q,), (v,)
-        )
+        _, bias = self._along(lambda t, q: self.velocity_constraint(t, q, v), uses_time, t, (q,), (v,))
         return bias
 
     # The underlying ODE
@@ -229,7 +228,8 @@ class MechanicalODE(ManifoldODE):
 
     def _rank_of(self, rows: int) -> int | None:
         """The rank of the first `rows` constraints: `rank` counts the holonomic and the nonholonomic ones together, and
-        the redundant ones are taken to be holonomic where there are any."""
+        the redundant ones are taken to be holonomic where there are any.
+        """
         if self.rank is None or rows == self.holonomic + self.nonholonomic:
             return self.rank
         return max(self.rank - self.nonholonomic, 0)

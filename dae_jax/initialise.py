@@ -91,7 +91,9 @@ def consistent_state(system: ConstrainedSystem, t0: Any, y0: Any, args: Any = No
     y, found, remains = _nearest(ode, jnp.asarray(t0, q.dtype), (q, v), weights)
     if not isinstance(found, jax.core.Tracer) and not bool(found):
         raise ValueError(
-            remains.message().replace("The initial state `y0` violates", "No consistent state was found near `y0`; left over are")
+            remains.message().replace(
+                "The initial state `y0` violates", "No consistent state was found near `y0`; left over are"
+            )
             + "\nThe constraints may contradict each other, or too many entries are fixed."
         )
     return ode.decode(t0, y)
@@ -121,7 +123,7 @@ def _improved(x: Float[Array, " 2n"], params: Any) -> Float[Array, " 2n"]:
     q, v = jnp.split(x, 2)
     m = ode.holonomic
     a = ode.normals(t, (q, v))[0]
-    metric = lambda w, rows: w[:, None] * mass_solve(ode.mass(q0), (rows * w).T)  # noqa: E731
+    metric = lambda w, rows: w[:, None] * mass_solve(ode.mass(q0), (rows * w).T)
     g, _ = ode.invariants(t, (q, v))
     if m:
         q = q0 - _least_norm(a[:m], metric(wq, a[:m]), g + jnp.dot(a[:m], q0 - q))

@@ -42,8 +42,6 @@ class Interpolation(eqx.Module):
     def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Any:
         """The state at `t0`, or its increment from `t0` to `t1`."""
         if t1 is not None:
-
-
             return jax.tree.map(lambda a, b: b - a, self.evaluate(t0, left=left), self.evaluate(t1, left=left))
         return self.decode(t0, self.path.evaluate(t0, left=left), self.ode)
 
@@ -80,8 +78,6 @@ class DAESolution(eqx.Module):
 
 def all_finite(ts: Any, ys: Any) -> Any:
     """Whether every saved state is finite; times that are not finite are padding."""
-
-
     saved = jnp.isfinite(ts)
     finite = [
         jnp.all(jnp.isfinite(y).reshape(y.shape[0], -1), axis=1)

@@ -61,18 +61,20 @@ def daesolve(
     """
     y0, args = _checked(system, t0, t1, dt0, y0, args)
     formulation = Differentiation() if formulation is None else formulation
-    _fits(system, formulation, solver, y0)
+    _fits(system, formulation, solver)
     dtype = jnp.result_type(*jax.tree.leaves(y0))
     if stepsize_controller is None:
         stepsize_controller = _default_controller(solver, dt0, dtype)
     t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
     dt0 = None if dt0 is None else jnp.asarray(dt0, dtype)
-    saveat, event = jax.tree.map(lambda x: jnp.asarray(x, dtype) if eqx.is_array_like(x) and not isinstance(x, bool | int) else x, (saveat, event))
+    saveat = jax.tree.map(lambda x: jnp.asarray(x, dtype) if isinstance(x, np.ndarray | jax.Array) else x, saveat)
     rank = system.rank
     checked = not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((system, t0, t1, saveat, y0, args)))
     if checked:
         rank = _refuse_bad_start(system, t0, t1, saveat, y0, args)
-    solve = _Solve(formulation, solver, saveat, stepsize_controller, adjoint, event, max_steps, progress_meter, rank, checked)
+    solve = _Solve(
+        formulation, solver, saveat, stepsize_controller, adjoint, event, max_steps, progress_meter, rank, checked
+    )
     sol = _jitted(solve, system, t0, t1, dt0, y0, args)
     return _raise_if_failed(sol) if throw else sol
 
@@ -91,7 +93,9 @@ def _checked(system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any) -> tup
         raise ValueError("`y0` = (q, v): q and v must have the same structure.")
     for a, b in zip(jax.tree.leaves(q), jax.tree.leaves(v), strict=True):
         if np.shape(a) != np.shape(b):
-            raise ValueError(f"`y0` = (q, v): q and v must have the same shape, but have {np.shape(a)} and {np.shape(b)}.")
+            raise ValueError(
+                f"`y0` = (q, v): q and v must have the same shape, but have {np.shape(a)} and {np.shape(b)}."
+            )
     for leaf in jax.tree.leaves(y0):
         dtype = jnp.result_type(leaf)
         if not jnp.issubdtype(dtype, jnp.floating):
@@ -108,7 +112,7 @@ def _checked(system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any) -> tup
     if dt0 is not None and not any(isinstance(x, jax.core.Tracer) for x in (t0, t1, dt0)) and (t1 - t0) * dt0 < 0:
         raise ValueError(f"`dt0` = {dt0} points away from `t1` = {t1}: it must have the sign of t1 − t0.")
     dtype = jnp.result_type(*jax.tree.leaves(y0))
-    as_array = lambda x: jnp.asarray(x) if isinstance(x, float | np.ndarray | np.generic) else x  # noqa: E731
+    as_array = lambda x: jnp.asarray(x) if isinstance(x, float | np.ndarray | np.generic) else x
     return (jax.tree.map(lambda x: jnp.asarray(x, dtype), tuple(y0)), jax.tree.map(as_array, args))
 
 
@@ -117,12 +121,14 @@ def _brief(x: Any) -> str:
     return text if len(text) < 200 else text[:200] + "…"
 
 
-def _fits(system: ConstrainedSystem, formulation: Any, solver: Any, y0: Any) -> None:
+def _fits(system: ConstrainedSystem, formulation: Any, solver: Any) -> None:
     """Refuses pairs of formulation and solver that make no sense, and shapes that do not fit."""
     if not isinstance(solver, diffrax.AbstractSolver):
         raise TypeError(f"`solver` must be a diffrax solver such as diffrax.Tsit5(), but is {_brief(solver)}.")
     if not isinstance(formulation, AbstractFormulation):
-        raise TypeError(f"`formulation` must be a formulation such as dae_jax.Baumgarte(...), but is {_brief(formulation)}.")
+        raise TypeError(
+            f"`formulation` must be a formulation such as dae_jax.Baumgarte(...), but is {_brief(formulation)}."
+        )
     if isinstance(formulation, StateSpace) and isinstance(solver, AbstractManifoldSolver):
         raise ValueError(
             f"StateSpace has no constraints left for {type(solver).__name__} to keep: in its chart they hold by "
@@ -157,14 +163,17 @@ def _refuse_bad_start(system: Any, t0: Any, t1: Any, saveat: Any, y0: Any, args:
             ts = np.asarray(sub.ts)
             low, high = min(t0, t1), max(t0, t1)
             if ts.size and (ts.min() < low or ts.max() > high):
-                raise ValueError(f"`saveat.ts` must lie between t0 = {t0} and t1 = {t1}, but spans {ts.min()} to {ts.max()}.")
+                raise ValueError(
+                    f"`saveat.ts` must lie between t0 = {t0} and t1 = {t1}, but spans {ts.min()} to {ts.max()}."
+                )
             steps = np.diff(ts) * (1 if t1 >= t0 else -1)
             if np.any(steps < 0):
                 raise ValueError("`saveat.ts` must be in the order in which the solve passes them.")
     found = _look(system, t0, y0, args)
     if not bool(found.consistent()):
         raise ValueError(
-            found.message() + "\n`dae_jax.consistent_state(system, t0, y0, args)` gives the nearest state that does not."
+            found.message()
+            + "\n`dae_jax.consistent_state(system, t0, y0, args)` gives the nearest state that does not."
         )
     count = found.residuals[1].shape[0]
     if system.rank is not None:
@@ -251,14 +260,18 @@ class _Solve(eqx.Module):
 
         def saved(sub: Any) -> Any:
             fn = sub.fn
-            view = lambda t, y, ode: fn(t, decode(t, y, ode), args)  # noqa: E731
+            view = lambda t, y, ode: fn(t, decode(t, y, ode), args)
             return eqx.tree_at(lambda s: s.fn, sub, view) if _is_sub(sub) else sub
 
         saveat = eqx.tree_at(
-            lambda s: s.subs, self.saveat, jax.tree.map(saved, self.saveat.subs, is_leaf=_is_sub), is_leaf=lambda x: x is None
+            lambda s: s.subs,
+            self.saveat,
+            jax.tree.map(saved, self.saveat.subs, is_leaf=_is_sub),
+            is_leaf=lambda x: x is None,
         )
         event = self.event and dataclasses.replace(
-            self.event, cond_fn=jax.tree.map(lambda c: _on_states(c, decode, args), self.event.cond_fn, is_leaf=callable)
+            self.event,
+            cond_fn=jax.tree.map(lambda c: _on_states(c, decode, args), self.event.cond_fn, is_leaf=callable),
         )
         sol = diffrax.diffeqsolve(
             self.formulation.term(),
@@ -275,7 +288,7 @@ class _Solve(eqx.Module):
         code = RESULTS.promote(result)
         _, _, ts, ys, _, stats = fields
         stuck = 2 * stats["num_rejected_steps"] > stats["num_steps"]
-        failed = lambda name, instead, when=True: RESULTS.where((code == name) & when, instead, code)  # noqa: E731
+        failed = lambda name, instead, when=True: RESULTS.where((code == name) & when, instead, code)
         code = failed(RESULTS.max_steps_reached, RESULTS.step_rejected, stuck)
         code = failed(RESULTS.nonlinear_divergence, RESULTS.off_manifold)
         if ts is not None:
@@ -292,9 +305,7 @@ def _saved(saveat: Any, ts: Any, ys: Any) -> list[tuple[Any, Any]]:
     """The (times, states) of each part of `saveat`."""
     structure = jax.tree.structure(saveat.subs, is_leaf=_is_sub)
     return [
-        (t, y)
-        for t, y in zip(structure.flatten_up_to(ts), structure.flatten_up_to(ys), strict=True)
-        if t is not None
+        (t, y) for t, y in zip(structure.flatten_up_to(ts), structure.flatten_up_to(ys), strict=True) if t is not None
     ]
 
 

@@ -102,9 +102,7 @@ class TestScalarise:
         close(jax.jvp(scalarise(fn), (X,), (V,)), jax.jvp(fn, (X,), (V,)))
 
     def test_grad(self, fn):
-        close(
-            jax.grad(lambda x: jnp.sum(jnp.sin(scalarise(fn)(x))))(X), jax.grad(lambda x: jnp.sum(jnp.sin(fn(x))))(X)
-        )
+        close(jax.grad(lambda x: jnp.sum(jnp.sin(scalarise(fn)(x))))(X), jax.grad(lambda x: jnp.sum(jnp.sin(fn(x))))(X))
 
     def test_vmap(self, fn):
         xs = jnp.stack([X, X + 0.1, X * 2])

@@ -14,6 +14,7 @@ The absolute tolerance equals the relative one throughout. States are as in `pro
 
 import importlib
 
+
 NAMES = (
     "c_limit",
     "heyoka_peer",

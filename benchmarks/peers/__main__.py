@@ -12,6 +12,7 @@ import numpy as np
 from .. import timing
 from . import NAMES, PACKAGES, load, problems
 
+
 REACHED = 1e-4  # what every peer must come within at its tightest tolerance
 
 

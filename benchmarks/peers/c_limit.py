@@ -16,6 +16,7 @@ import numpy as np
 
 from . import problems
 
+
 name = "C DOP853"
 methods = ("projected", "plain")
 FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-shared", "-fPIC")

@@ -8,6 +8,7 @@ import numpy as np
 
 from . import missing, problems
 
+
 name = "CasADi"
 methods = ("CVODES", "IDAS")
 OPTIONS = {

@@ -2,6 +2,7 @@
 
 from . import missing, problems
 
+
 name = "Drake"
 methods = ("runge_kutta5",)
 

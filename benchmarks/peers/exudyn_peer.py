@@ -7,6 +7,7 @@ import numpy as np
 
 from . import missing, problems
 
+
 name = "Exudyn"
 methods = ("DOPRI5", "RK67")
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from . import missing, problems
 
+
 name = "heyoka"
 methods = ("taylor",)
 LARGEST_CHAIN = 32

@@ -6,6 +6,7 @@ inertia; 1e-14 beside the point masses is below every error in the tables.
 
 from . import missing, problems
 
+
 name = "MuJoCo"
 methods = ("RK4",)
 

@@ -4,6 +4,7 @@ import numpy as np
 
 from . import missing, problems
 
+
 name = "Pinocchio + scipy"
 methods = ("DOP853",)
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from . import missing, problems
 
+
 name = "diffrax, hand-reduced"
 methods = ("Dopri8", "Tsit5")
 

@@ -5,6 +5,7 @@ States are flat: positions (x1, y1, x2, y2, ...), then velocities in the same or
 
 import numpy as np
 
+
 GRAVITY = 9.81
 
 # Double pendulum released horizontally at rest, t = 10: heyoka's Taylor method at 140 bits and tolerance 1e-30. An

@@ -8,6 +8,7 @@ import numpy as np
 
 from . import missing, residuals
 
+
 name = "solve_dae"
 methods = ("Radau, 7 stages", "Radau, 3 stages", "BDF")
 OPTIONS = {

@@ -7,6 +7,7 @@ import numpy as np
 
 from . import missing, problems, residuals
 
+
 name = "IDA (scikit-sundae)"
 methods = ("index 1",)
 

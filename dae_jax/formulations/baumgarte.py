@@ -32,7 +32,9 @@ class Baumgarte(AbstractFormulation):
         self.alpha = jnp.asarray(alpha, jnp.result_type(float, alpha))
         self.beta = jnp.asarray(beta, jnp.result_type(float, beta))
 
-    def encode(self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None) -> tuple[Any, ManifoldODE]:
+    def encode(
+        self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None
+    ) -> tuple[Any, ManifoldODE]:
         ode = MechanicalODE.of(system, t, state, args, rank)
         return ode.encode(state), ode
 

@@ -20,7 +20,9 @@ class AbstractFormulation(eqx.Module):
     """
 
     @abc.abstractmethod
-    def encode(self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None) -> tuple[Any, ManifoldODE]:
+    def encode(
+        self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None
+    ) -> tuple[Any, ManifoldODE]:
         """The integration variables of `state`, and the underlying ODE."""
 
     def term(self) -> diffrax.ODETerm:
@@ -45,7 +47,9 @@ class Differentiation(AbstractFormulation):
     restore them the error in g grows like t² and that in ġ like t (*drift-off*).
     """
 
-    def encode(self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None) -> tuple[Any, ManifoldODE]:
+    def encode(
+        self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None
+    ) -> tuple[Any, ManifoldODE]:
         ode = MechanicalODE.of(system, t, state, args, rank)
         return ode.encode(state), ode
 

@@ -36,7 +36,9 @@ class StateSpace(AbstractFormulation):
     chart: Callable[..., Any]
     guess: Any = None
 
-    def encode(self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None) -> tuple[Any, "ChartODE"]:
+    def encode(
+        self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None
+    ) -> tuple[Any, "ChartODE"]:
         mechanical = MechanicalODE.of(system, t, state, args, rank)
         if mechanical.nonholonomic:
             raise ValueError(
@@ -88,9 +90,9 @@ class ChartODE(eqx.Module):
         _, bias = ode._along(lambda t, z: self.velocity(t, z, w), self.takes_time, t, (z,), (w,))
         mass = ode.mass(q)
         if mass is None:
-            apply: Callable[[Any], Any] = lambda x: x  # noqa: E731
+            apply: Callable[[Any], Any] = lambda x: x
         elif mass.ndim < 2:
-            apply = lambda x: (mass * x.T).T  # noqa: E731
+            apply = lambda x: (mass * x.T).T
         else:
             apply = functools.partial(jnp.dot, mass)
         reduced = jnp.dot(jacobian.T, apply(jacobian))

@@ -118,9 +118,7 @@ def _is_check(eqn: Any) -> bool:
     return getattr(callback, "__module__", None) == "equinox._errors"
 
 
-def one_kernel(
-    fn: Callable[..., Any], derivative: Literal["forward", "reverse", "any"] = "any"
-) -> Callable[..., Any]:
+def one_kernel(fn: Callable[..., Any], derivative: Literal["forward", "reverse", "any"] = "any") -> Callable[..., Any]:
     """`fn` (pytrees of arrays to a pytree of arrays), compiled to one kernel on the CPU where it qualifies.
 
     On another backend, or where `hindrances` finds a reason, it is `fn` itself. Under `vmap` the batched function is

@@ -20,9 +20,7 @@ def solve(a: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:
     def eliminated(matrix):
         return lambda _, right: _gauss_jordan(matrix, right)
 
-    return lax.custom_linear_solve(
-        lambda x: jnp.sum(a * x, 1), b, solve=eliminated(a), transpose_solve=eliminated(a.T)
-    )
+    return lax.custom_linear_solve(lambda x: jnp.sum(a * x, 1), b, solve=eliminated(a), transpose_solve=eliminated(a.T))
 
 
 def _gauss_jordan(a: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -47,7 +47,8 @@ def chain(n: int = 8, gravity: float = 9.81) -> Scene:
 
 def _chain_field(gravity: float):
     """Lagrange's equations of n unit pendulums in angles: Σⱼ mᵢⱼ (cos(θᵢ−θⱼ) θ̈ⱼ + sin(θᵢ−θⱼ) θ̇ⱼ²) = −mᵢᵢ g sin θᵢ, with
-    mᵢⱼ the mass below both joints, n − max(i, j)."""
+    mᵢⱼ the mass below both joints, n − max(i, j).
+    """
 
     def field(t: float, z: np.ndarray) -> np.ndarray:
         angle, rate = np.split(z, 2)

@@ -37,9 +37,7 @@ def slider_crank(crank: float = 1.0, rod: float = 2.5, gravity: float = 9.81) ->
         position, first, _ = slider(z[0])
         return np.array([z[0], position]), np.array([z[1], first * z[1]])
 
-    chart = lambda z: jnp.stack(
-        [z[0], crank * jnp.sin(z[0]) + jnp.sqrt(rod**2 - crank**2 * jnp.cos(z[0]) ** 2)]
-    )
+    chart = lambda z: jnp.stack([z[0], crank * jnp.sin(z[0]) + jnp.sqrt(rod**2 - crank**2 * jnp.cos(z[0]) ** 2)])
     start = [2.0, 0.5]
     return Scene("slider-crank", system, embed(0.0, np.array(start)), 10.0, minimal(field, start, embed), chart=chart)
 

@@ -104,6 +104,4 @@ def spherical_pendulum(polar: float = 1.0, azimuthal_rate: float = 2.0, gravity:
         return q, np.array([rate * c * cp - turn * s * sp, rate * c * sp + turn * s * cp, -rate * s])
 
     start = [polar, 0.0, 0.0]
-    return Scene(
-        "spherical-pendulum", system, embed(0.0, np.array(start)), 10.0, minimal(field, start, embed)
-    )
+    return Scene("spherical-pendulum", system, embed(0.0, np.array(start)), 10.0, minimal(field, start, embed))

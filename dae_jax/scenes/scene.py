@@ -38,7 +38,8 @@ def minimal(
     field: Callable[[float, np.ndarray], np.ndarray], z0: list[float], embed: Callable[[np.ndarray, np.ndarray], State]
 ) -> Callable[[np.ndarray], State]:
     """A reference from ż = field(t, z) in minimal coordinates, by scipy's DOP853 at rtol 1e-13; `embed(t, z)` is (q, v)
-    for one time and state."""
+    for one time and state.
+    """
 
     def reference(times: np.ndarray) -> State:
         from scipy.integrate import solve_ivp

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 
-def identity(t: Any, y: Any) -> tuple[Any, bool]:
+def identity(_: Any, y: Any) -> tuple[Any, bool]:
     """Lands nowhere else."""
     return y, True
 
@@ -77,8 +77,8 @@ class Unrolled(diffrax.AbstractWrappedSolver):
         """`step`, with its end moved to `land(t1, y1)` → (y1, found)."""
         tableau = self.solver.tableau
         control = terms.contr(t0, t1)
-        field = lambda t, y: terms.vf(t, y, args)  # noqa: E731
-        scaled = lambda f: jax.tree.map(lambda x: control * x, f)  # noqa: E731
+        field = lambda t, y: terms.vf(t, y, args)
+        scaled = lambda f: jax.tree.map(lambda x: control * x, f)
         f0 = first_derivative(field, t0, y0, state, made_jump)
         rows, nodes = tableau.a_lower, tableau.c
         f1 = None

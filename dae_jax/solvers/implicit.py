@@ -40,7 +40,7 @@ class AbstractImplicitSolver(diffrax.AbstractSolver):
         return None
 
     def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any) -> Any:
-        flat, unravel = ravel_pytree(y0)
+        flat, _ = ravel_pytree(y0)
         size = len(self.tableau.implicit) * flat.size
 
         def residual(z: Any, params: Any) -> Any:

@@ -88,9 +88,7 @@ class TangentSpace(AbstractManifoldSolver, diffrax.AbstractAdaptiveSolver):
         first = args.tangent(solver_state, chart) if made_jump is False else None
         first = tangent_term.vf(t0, y0, None) if first is None else first
         wrapped = _Controlled(tangent_term, terms)
-        u1, error, dense, _, _ = solver.landing_step(
-            wrapped, t0, t1, y0, None, first, False, lambda t, u: (u, True)
-        )
+        u1, error, dense, _, _ = solver.landing_step(wrapped, t0, t1, y0, None, first, False, lambda t, u: (u, True))
         y1, found = args.restore(sign * t1, u1, chart)
         error = None if error is None else or_nan(found, error)
         y1 = or_nan(found, y1)

@@ -18,11 +18,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 
-from . import incidence_contractions as contractions
-from . import incidence_control as control
-from . import incidence_entries as entries
-from . import incidence_indexing as indexing
+from . import (
+    incidence_contractions as contractions,
+    incidence_control as control,
+    incidence_entries as entries,
+    incidence_indexing as indexing,
+)
 from .cells import Cells, as_rows, evaluate, has_extended_dtype
+
 
 Rule = Callable[[Any, list[Cells]], list[Cells]]
 
@@ -116,7 +119,8 @@ def dependence(fn: Callable[..., Any], *example_args: Any, derivative: bool = Fa
 
 def signature(*patterns: np.ndarray) -> list[dict[int, int]]:
     """For each equation its variables with their highest derivative, from the patterns of shape (equations, variables)
-    with respect to the variables themselves, their first derivatives, their second derivatives, and so on."""
+    with respect to the variables themselves, their first derivatives, their second derivatives, and so on.
+    """
     rows: list[dict[int, int]] = [{} for _ in range(patterns[0].shape[0])]
     for order, pattern in enumerate(patterns):
         for equation, variable in np.argwhere(pattern):

@@ -7,6 +7,7 @@ import numpy as np
 
 from .cells import Cells, as_sets, evaluate, union, unless
 
+
 REDUCTIONS = frozenset(
     [
         "argmax",

@@ -11,6 +11,7 @@ from .cells import Cells, as_rows, union
 from .incidence_entries import together
 from .matching import maximum_matching
 
+
 # Loops of more steps than this are summarised by a fixed point.
 LONGEST_LOOP = 10_000
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from .cells import Cells, evaluate, unless
 
+
 # Constants are computed by numpy where it agrees with XLA to the last bit: it needs no compilation.
 _NUMPY: dict[str, Callable[..., Any]] = {
     "abs": np.abs,

@@ -14,6 +14,7 @@ import numpy as np
 
 from .cells import Cells, as_sets, union, unless
 
+
 SCATTERS = {
     "scatter": None,
     "scatter-add": np.add,

@@ -1,0 +1,8 @@
+"""`python -m dae_jax`."""
+
+import sys
+
+from .cli import main
+
+
+sys.exit(main())

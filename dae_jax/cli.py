@@ -1,0 +1,60 @@
+"""The command line: `dae-jax`, also `python -m dae_jax`."""
+
+import argparse
+import importlib.metadata
+import sys
+from pathlib import Path
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs one command; the exit status is 2 for wrong arguments."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    parser = argparse.ArgumentParser(prog="dae-jax", description="Differential-algebraic equations in JAX.")
+    parser.add_argument("--version", action="version", version=importlib.metadata.version("dae_jax"))
+    commands = parser.add_subparsers(dest="command", required=True)
+    _add_compare(commands)
+    arguments = parser.parse_args(argv)
+    return arguments.run(parser, arguments)
+
+
+def _add_compare(commands: argparse._SubParsersAction) -> None:
+    from .scenes import SCENES
+
+    parser = commands.add_parser("compare", help="solve a scene by every method; print a table and draw the figures")
+    parser.add_argument("scene", metavar="SCENE", help=", ".join(SCENES))
+    parser.add_argument("--methods", help="names, separated by commas; by default all")
+    parser.add_argument("--t1", type=float, help="end time in s; by default the scene's own")
+    parser.add_argument("--rtol", type=float, default=1e-8, help="tolerance, relative and absolute; by default 1e-8")
+    parser.add_argument("--out", type=Path, help="folder for table, data and figures; by default compare-SCENE")
+    parser.set_defaults(run=_compare)
+
+
+def _compare(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> int:
+    from .compare import compare, table, write
+    from .scenes import SCENES
+
+    if arguments.scene not in SCENES:
+        parser.error(f"unknown scene {arguments.scene!r}; choose from {', '.join(SCENES)}")
+    scene = SCENES[arguments.scene]()
+    t1 = scene.t1 if arguments.t1 is None else arguments.t1
+    if not t1 > 0:
+        parser.error(f"--t1 must be positive, but is {t1}")
+    names = arguments.methods.split(",") if arguments.methods else None
+    try:
+        results = list(compare(scene, names, t1, arguments.rtol))
+    except ValueError as refusal:
+        parser.error(str(refusal))
+    rows = [row for row, _ in results]
+    print(f"{scene.name}, {t1:g} s, tolerance {arguments.rtol:g}; error and drifts are the largest over 501 times")
+    print(table(rows))
+    solutions = {row.method: sol for row, sol in results if sol is not None}
+    folder = arguments.out or Path(f"compare-{scene.name}")
+    for path in write(scene, rows, solutions, arguments.rtol, folder):
+        print(path)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

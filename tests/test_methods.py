@@ -1,0 +1,117 @@
+"""What every method promises: its order, its drift, its derivatives, and the same under vmap."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dae_jax
+from dae_jax.scenes import pendulum
+from tests.methods import METHODS
+
+
+SCENE = pendulum()
+# Coarse enough to stay above round-off, fine enough to be in the asymptotic regime.
+STEPS = {1: (400, 1600), 2: (50, 100), 4: (25, 50), 5: (20, 40), 8: (12, 24)}
+
+
+def solve(method, t1, h, y0=SCENE.y0, system=SCENE.system, args=None, adjoint=None, **options):
+    adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
+    return dae_jax.daesolve(
+        system, method.solver, 0.0, t1, h, y0, args, formulation=method.formulation, adjoint=adjoint, max_steps=10_000, **options
+    )  # fmt: skip
+
+
+def error(method, steps, t1=1.0):
+    sol = solve(method, t1, t1 / steps, stepsize_controller=diffrax.ConstantStepSize())
+    exact = SCENE.reference(np.array([t1]))
+    return max(float(np.abs(np.asarray(a) - b).max()) for a, b in zip(sol.ys, exact, strict=True))
+
+
+@pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
+def test_order_is_measured(method):
+    coarse, fine = STEPS[method.order]
+    slope = np.log(error(method, coarse) / error(method, fine)) / np.log(fine / coarse)
+    # Superconvergence is no failure; order 8 is measured over one halving close to round-off.
+    assert slope > method.order - (0.5 if method.order == 8 else 0.25)
+
+
+@pytest.mark.parametrize("method", [m for m in METHODS if m.keeps], ids=lambda m: m.name)
+def test_methods_that_keep_the_constraints_keep_them_between_steps_too(method):
+    times = np.linspace(0, 2, 41)
+    sol = solve(method, 2.0, 0.02, saveat=diffrax.SaveAt(ts=times))
+    off = dae_jax.drift(SCENE.system, sol)
+    assert off.position.max() <= 1e-13
+    assert off.velocity.max() <= 1e-13
+
+
+@pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
+def test_gradients_agree_in_both_modes_and_with_central_differences(method):
+    """Of the end state with respect to the angle of the start and gravity (`args`)."""
+    system = dae_jax.ConstrainedSystem(lambda t, q, v, g: jnp.stack([0 * g, g]), SCENE.system.constraint)
+    weights = jnp.array([0.3, -0.7])
+
+    def end(x, adjoint):
+        angle, gravity = x
+        y0 = (jnp.stack([jnp.sin(angle), jnp.cos(angle)]), jnp.stack([jnp.cos(angle), -jnp.sin(angle)]))
+        # For fixed steps the derivative of the discrete map is that of the numbers that central differences see.
+        sol = solve(method, 0.5, 0.05, y0, system, gravity, adjoint, stepsize_controller=diffrax.ConstantStepSize())
+        return jnp.dot(weights, sol.ys[0][-1]) + jnp.dot(weights, sol.ys[1][-1])
+
+    x = jnp.array([1.2, 9.81])
+    reverse = jax.grad(lambda x: end(x, diffrax.RecursiveCheckpointAdjoint()))(x)
+    forward = jax.jacfwd(lambda x: end(x, diffrax.ForwardMode()))(x)
+    plain = jax.jit(jax.vmap(lambda x: end(x, diffrax.RecursiveCheckpointAdjoint())))
+    h = 1e-5
+    values = plain(jnp.concatenate([x + h * jnp.eye(2), x - h * jnp.eye(2)]))
+    central = (values[:2] - values[2:]) / (2 * h)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(reverse, central, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
+def test_vmap_is_one_at_a_time(method):
+    def end(angle):
+        y0 = (jnp.stack([jnp.sin(angle), jnp.cos(angle)]), jnp.zeros(2))
+        return solve(method, 0.5, 0.05, y0).ys[0][-1]
+
+    angles = jnp.array([0.5, 1.0, 2.5])
+    together = jax.vmap(end)(angles)
+    np.testing.assert_allclose(together, jnp.stack([end(a) for a in angles]), rtol=1e-12, atol=1e-12)
+
+
+def test_gradient_with_respect_to_baumgartes_parameters():
+    def end(x, adjoint):
+        sol = dae_jax.daesolve(
+            SCENE.system, diffrax.Tsit5(), 0.0, 0.5, 0.05, SCENE.y0, formulation=dae_jax.Baumgarte(x[0], x[1]), adjoint=adjoint
+        )
+        return jnp.sum(sol.ys[0])
+
+    x = jnp.array([3.0, 5.0])
+    reverse = jax.grad(lambda x: end(x, diffrax.RecursiveCheckpointAdjoint()))(x)
+    forward = jax.jacfwd(lambda x: end(x, diffrax.ForwardMode()))(x)
+    h = 1e-4
+    value = lambda x: end(x, diffrax.RecursiveCheckpointAdjoint())
+    central = jnp.stack([(value(x + h * e) - value(x - h * e)) / (2 * h) for e in jnp.eye(2)])
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
+    np.testing.assert_allclose(reverse, central, rtol=1e-5, atol=1e-12)
+
+
+def test_symmetric_projection_goes_back_to_where_it_came_from():
+    method = dae_jax.SymmetricProjection(dae_jax.Trapezoid())
+    there = dae_jax.daesolve(SCENE.system, method, 0.0, 1.0, 0.02, SCENE.y0)
+    back = dae_jax.daesolve(SCENE.system, method, 1.0, 0.0, -0.02, jax.tree.map(lambda x: x[-1], there.ys))
+    for a, b in zip(back.ys, SCENE.y0, strict=True):
+        np.testing.assert_allclose(a[-1], b, atol=1e-12)
+
+
+@pytest.mark.parametrize("solver", [dae_jax.OrthogonalProjection(dae_jax.DOP853()), dae_jax.TangentSpace(diffrax.Tsit5())])
+def test_backwards_in_time_with_a_constraint_that_depends_on_time(solver):
+    scene = dae_jax.scenes.moving_pivot_pendulum()
+    q, v = (x[0] for x in scene.reference(np.array([2.0])))
+    times = np.array([2.0, 1.3, 0.6, 0.0])
+    sol = dae_jax.daesolve(scene.system, solver, 2.0, 0.0, None, (q, v), saveat=diffrax.SaveAt(ts=times))
+    exact = scene.reference(times)
+    np.testing.assert_allclose(sol.ys[0], exact[0], atol=1e-6)
+    assert dae_jax.drift(scene.system, sol).position.max() < 1e-13

@@ -1,0 +1,128 @@
+"""The findings of Pöll, Hafner and Heinzl, and the accuracy that the library claims."""
+
+import diffrax
+import numpy as np
+import pytest
+
+import dae_jax
+from dae_jax.scenes import SCENES, double_pendulum, pendulum
+
+
+def speeds(solver, h, t1, times):
+    scene = pendulum()
+    sol = dae_jax.daesolve(
+        scene.system, solver, 0.0, t1, h, scene.y0, saveat=diffrax.SaveAt(ts=times), max_steps=1_000_000
+    )
+    return np.asarray(dae_jax.energy(scene.system, sol))
+
+
+def test_differentiation_drifts_off_quadratically():
+    scene = pendulum()
+    times = np.array([25.0, 50.0, 100.0])
+    sol = dae_jax.daesolve(
+        scene.system, diffrax.Tsit5(), 0.0, 100.0, 0.02, scene.y0, saveat=diffrax.SaveAt(ts=times), max_steps=100_000
+    )
+    position, velocity = dae_jax.drift(scene.system, sol)
+    slopes = np.diff(np.log(position)) / np.log(2)
+    assert np.all((slopes > 1.7) & (slopes < 2.3))
+    assert position[-1] > 100 * 1e-9
+
+
+def test_energy_grows_under_projected_euler_only():
+    times = np.linspace(0, 100, 1001)
+    euler = speeds(dae_jax.OrthogonalProjection(diffrax.Euler()), 0.005, 100.0, times)
+    symmetric = speeds(dae_jax.SymmetricProjection(dae_jax.Trapezoid()), 0.02, 100.0, times)
+    assert euler[500] > euler[0] + 1
+    first, last = symmetric[:250], symmetric[-250:]
+    # No secular trend: the mean of the last quarter is that of the first, to a tenth of the oscillation.
+    assert abs(first.mean() - last.mean()) < 0.1 * np.ptp(symmetric)
+
+
+@pytest.mark.parametrize(("alpha", "beta"), [(5.0, 5.0), (10.0, 5.0), (3.0, 8.0)])
+def test_baumgartes_drift_follows_its_characteristic_polynomial(alpha, beta):
+    """From a start with g = δ the constraint obeys g̈ + 2αġ + β²g = 0."""
+    scene = pendulum()
+    system = dae_jax.ConstrainedSystem(scene.system.force, scene.system.constraint)
+    delta = 1e-9
+    q0 = scene.y0[0] * (1 + delta)
+    times = np.linspace(0, 1, 11)
+    sol = dae_jax.daesolve(
+        system, dae_jax.DOP853(), 0.0, 1.0, None, (q0, scene.y0[1]), formulation=dae_jax.Baumgarte(alpha, beta),
+        saveat=diffrax.SaveAt(ts=times), stepsize_controller=diffrax.PIDController(1e-13, 1e-13),
+    )  # fmt: skip
+    roots = np.roots([1, 2 * alpha, beta**2]).astype(complex)
+    if roots[0] == roots[1]:
+        expected = delta * (1 - roots[0] * times) * np.exp(roots[0] * times)
+    else:
+        a, b = roots
+        expected = delta * (b * np.exp(a * times) - a * np.exp(b * times)) / (b - a)
+    np.testing.assert_allclose(dae_jax.drift(system, sol).position, np.abs(expected.real), atol=2e-3 * delta)
+
+
+def test_a_stiff_choice_of_baumgartes_parameters_still_solves():
+    scene = double_pendulum()
+    sol = dae_jax.daesolve(
+        scene.system, diffrax.Tsit5(), 0.0, 2.0, None, scene.y0, formulation=dae_jax.Baumgarte(100.0, 1000.0), max_steps=100_000
+    )
+    exact = scene.reference(np.array([2.0]))
+    np.testing.assert_allclose(sol.ys[0], exact[0], atol=1e-5)
+
+
+CHARTLESS = [dae_jax.OrthogonalProjection(diffrax.Dopri8()), dae_jax.TangentSpace(diffrax.Dopri8())]
+
+
+@pytest.mark.parametrize("solver", [*CHARTLESS, diffrax.Dopri8()], ids=["projection", "tangent", "state-space"])
+@pytest.mark.parametrize(("name", "t1", "tolerance"), [("pendulum", 10.0, 1e-8), ("double-pendulum", 5.0, 1e-7)])
+def test_accuracy_at_1e_10(name, t1, tolerance, solver):
+    scene = SCENES[name]()
+    formulation = dae_jax.StateSpace(scene.chart) if isinstance(solver, diffrax.Dopri8) else None
+    times = np.linspace(0, t1, 101)
+    sol = dae_jax.daesolve(
+        scene.system, solver, 0.0, t1, None, scene.y0, formulation=formulation, saveat=diffrax.SaveAt(ts=times),
+        stepsize_controller=diffrax.PIDController(1e-10, 1e-10),
+    )  # fmt: skip
+    for found, exact in zip(sol.ys, scene.reference(times), strict=True):
+        assert np.abs(np.asarray(found) - exact).max() < tolerance
+    off = dae_jax.drift(scene.system, sol)
+    assert max(off.position.max(), off.velocity.max()) <= 1e-13
+
+
+@pytest.mark.parametrize("name", sorted(SCENES))
+@pytest.mark.parametrize("solver", [dae_jax.OrthogonalProjection(dae_jax.DOP853())], ids=["projection"])
+def test_every_scene_follows_its_reference(name, solver):
+    scene = SCENES[name]()
+    t1 = min(scene.t1, 3.0)
+    times = np.linspace(0, t1, 31)
+    sol = dae_jax.daesolve(scene.system, solver, 0.0, t1, None, scene.y0, saveat=diffrax.SaveAt(ts=times))
+    for found, exact in zip(sol.ys, scene.reference(times), strict=True):
+        np.testing.assert_allclose(found, exact, atol=2e-6)
+    off = dae_jax.drift(scene.system, sol)
+    assert max(off.position.max(), off.velocity.max()) <= 1e-13
+
+
+def test_the_double_pendulums_reference_has_the_published_digits():
+    q, v = double_pendulum().reference(np.array([10.0]))
+    published = [-0.53834724, 0.84272312, -1.04076578, 1.70734766, 5.12239545, 3.27228172, -3.24834664, -1.59181341]
+    np.testing.assert_allclose(np.concatenate([q[0], v[0]]), published, atol=2e-8)
+
+
+def test_redundant_constraints_give_multipliers_of_least_norm():
+    plain, redundant = SCENES["four-bar"](), SCENES["four-bar-redundant"]()
+    a, b = (
+        dae_jax.daesolve(s.system, diffrax.Tsit5(), 0.0, 0.1, None, s.y0, saveat=diffrax.SaveAt(t0=True)) for s in (plain, redundant)
+    )
+    assert b.rank == 3
+    few, many = (np.asarray(dae_jax.multipliers(s.system, x))[0] for s, x in ((plain, a), (redundant, b)))
+    assert np.linalg.norm(many) < np.linalg.norm(few)
+
+
+@pytest.mark.parametrize("rate", [0.5, 7.0, -7.0])
+def test_the_pendulums_reference_satisfies_its_equation(rate):
+    scene = pendulum(angle=0.4, angular_velocity=rate)
+    h, times = 1e-4, np.linspace(0.1, 4, 20)
+    q, v = scene.reference(times)
+    before, after = scene.reference(times - h)[1], scene.reference(times + h)[1]
+    tangent = np.stack([q[:, 1], -q[:, 0]], 1)
+    acceleration = np.sum((after - before) / (2 * h) * tangent, 1)
+    np.testing.assert_allclose(acceleration, 9.81 * tangent[:, 1], atol=1e-5)
+    np.testing.assert_allclose([scene.reference(np.zeros(1))[i][0] for i in (0, 1)], scene.y0, atol=1e-12)
