@@ -136,6 +136,8 @@ def figures(scene: Scene, solutions: dict[str, Any], rtol: float) -> Iterator[tu
     curves = {
         name: (np.asarray(sol.ts), np.asarray(drift(scene.system, sol).position)) for name, sol in solutions.items()
     }
+    if not curves:
+        return
     yield "drift", lambda: plotting.drift(curves, f"{scene.name}: drift off the constraints")
     if scene.name == "pendulum":
         yield "fig4_drift_off", lambda: _drift_off(scene)

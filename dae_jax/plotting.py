@@ -1,20 +1,16 @@
 """Figures. The only module that imports matplotlib, and only when a figure is drawn."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 # Okabe and Ito's colours, told apart by colour-blind readers too.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
 
 
-def _figure(width: float = 6.4, height: float = 4.0) -> tuple["Figure", Any]:
+def _figure(width: float = 6.4, height: float = 4.0) -> tuple[Any, Any]:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained", dpi=150)
@@ -32,7 +28,7 @@ def _curves(
         getattr(axes, plot)(np.asarray(x), y, style, color=COLOURS[i % len(COLOURS)], linewidth=1.2, label=label)
 
 
-def drift(curves: Mapping[str, tuple[np.ndarray, np.ndarray]], title: str = "Drift off the constraints") -> "Figure":
+def drift(curves: Mapping[str, tuple[np.ndarray, np.ndarray]], title: str = "Drift off the constraints") -> Any:
     """The largest constraint violation max |g| over time on a log axis; `curves` maps a label to (times, drift).
 
     What is below 1e-17 is drawn there.
@@ -44,7 +40,7 @@ def drift(curves: Mapping[str, tuple[np.ndarray, np.ndarray]], title: str = "Dri
     return figure
 
 
-def over_time(curves: Mapping[str, tuple[np.ndarray, np.ndarray]], quantity: str, title: str = "") -> "Figure":
+def over_time(curves: Mapping[str, tuple[np.ndarray, np.ndarray]], quantity: str, title: str = "") -> Any:
     """Any quantity over time; `quantity` labels its axis, with the unit."""
     figure, axes = _figure(7.2)
     _curves(axes, curves, "plot")
@@ -53,7 +49,7 @@ def over_time(curves: Mapping[str, tuple[np.ndarray, np.ndarray]], quantity: str
     return figure
 
 
-def phase_portrait(curves: Mapping[str, tuple[np.ndarray, np.ndarray]], position: str, velocity: str) -> "Figure":
+def phase_portrait(curves: Mapping[str, tuple[np.ndarray, np.ndarray]], position: str, velocity: str) -> Any:
     """Velocity over position; `curves` maps a label to (positions, velocities)."""
     figure, axes = _figure()
     _curves(axes, curves, "plot")
@@ -62,7 +58,7 @@ def phase_portrait(curves: Mapping[str, tuple[np.ndarray, np.ndarray]], position
     return figure
 
 
-def trajectory(times: np.ndarray, path: np.ndarray, first: float = 10.0, title: str = "") -> "Figure":
+def trajectory(times: np.ndarray, path: np.ndarray, first: float = 10.0, title: str = "") -> Any:
     """A path in the plane, `path` of shape (times, 2) with y pointing down: until `first` in red, then in black."""
     figure, axes = _figure(5.0, 5.0)
     early = np.asarray(times) <= first
@@ -76,7 +72,7 @@ def trajectory(times: np.ndarray, path: np.ndarray, first: float = 10.0, title: 
     return figure
 
 
-def work_precision(points: Mapping[str, tuple[Sequence[float], Sequence[float]]]) -> "Figure":
+def work_precision(points: Mapping[str, tuple[Sequence[float], Sequence[float]]]) -> Any:
     """Error against run time on log axes; `points` maps a label to (run times in s, errors)."""
     figure, axes = _figure(7.2)
     for i, (label, (times, errors)) in enumerate(points.items()):

@@ -23,7 +23,7 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "the method."
     )
     step_rejected = (
-        "Nearly all steps were rejected, down to the smallest: at the last time reached the force is not finite, or the "
+        "The step size went to the resolution of time: at the last time reached the force is not finite, or the "
         "constraints become dependent there (a singular configuration)."
     )
     off_manifold = (

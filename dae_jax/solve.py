@@ -16,6 +16,7 @@ from .initialise import violation
 from .kernels import one_kernel
 from .solution import RESULTS, DAESolution, Interpolation, all_finite
 from .solvers import DOP853, RATTLE, AbstractManifoldSolver, OrthogonalProjection, TangentSpace, unrolled
+from .solvers.tangent_space import TangentPoint
 from .systems import ConstrainedSystem
 
 
@@ -280,16 +281,17 @@ class _Solve(eqx.Module):
             args=ode, saveat=saveat, stepsize_controller=self.controller, adjoint=self.adjoint, event=event,
             max_steps=self.max_steps, throw=False, progress_meter=self.progress_meter,
         )  # fmt: skip
-        interpolation = None if sol.interpolation is None else Interpolation(sol.interpolation, decode, ode)
+        interpolation = None
+        if sol.interpolation is not None:
+            interpolation = Interpolation(_uniform(self.solver, sol.interpolation), decode, ode)
         return sol.t0, sol.t1, sol.ts, sol.ys, interpolation, sol.stats, sol.result, sol.event_mask
 
     def _solution(self, out: Any, system: Any, t0: Any, y0: Any, args: Any) -> DAESolution:
         *fields, result, event_mask = out
         code = RESULTS.promote(result)
-        _, _, ts, ys, _, stats = fields
-        stuck = 2 * stats["num_rejected_steps"] > stats["num_steps"]
+        _, _, ts, ys, *_ = fields
         failed = lambda name, instead, when=True: RESULTS.where((code == name) & when, instead, code)
-        code = failed(RESULTS.max_steps_reached, RESULTS.step_rejected, stuck)
+        code = failed(RESULTS.dt_min_reached, RESULTS.step_rejected)
         code = failed(RESULTS.nonlinear_divergence, RESULTS.off_manifold)
         if ts is not None:
             finite = [all_finite(*pair) for pair in _saved(self.saveat, ts, ys)]
@@ -309,9 +311,27 @@ def _saved(saveat: Any, ts: Any, ys: Any) -> list[tuple[Any, Any]]:
     ]
 
 
+def _floored(controller: Any, t0: Any, t1: Any) -> Any:
+    """The controller with a smallest step at the resolution of time, below which a solve cannot get on."""
+    if type(controller) is not diffrax.PIDController or controller.dtmin is not None:
+        return controller
+    floor = 16 * jnp.finfo(jnp.result_type(t0)).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+    return dataclasses.replace(controller, dtmin=floor, force_dtmin=False)
+
+
+def _uniform(solver: Any, path: diffrax.DenseInterpolation) -> diffrax.DenseInterpolation:
+    """The dense output with one type of point, also for an interval of length 0."""
+    if not isinstance(solver, TangentSpace):
+        return path
+    first = TangentPoint(path.y0_if_trivial, jax.tree.map(lambda x: x[0], path.infos["normals"]))
+    return eqx.tree_at(lambda p: p.y0_if_trivial, path, first)
+
+
 def _on_states(cond: Callable[..., Any], decode: Any, args: Any) -> Callable[..., Any]:
-    def condition(t: Any, y: Any, ode: Any, **kwargs: Any) -> Any:
-        return cond(t, decode(t, y, ode), args, **kwargs)
+    user_args = args
+
+    def condition(t: Any, y: Any, args: Any, **kwargs: Any) -> Any:
+        return cond(t, decode(t, y, args), user_args, **kwargs)
 
     return condition
 

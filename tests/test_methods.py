@@ -84,7 +84,14 @@ def test_vmap_is_one_at_a_time(method):
 def test_gradient_with_respect_to_baumgartes_parameters():
     def end(x, adjoint):
         sol = dae_jax.daesolve(
-            SCENE.system, diffrax.Tsit5(), 0.0, 0.5, 0.05, SCENE.y0, formulation=dae_jax.Baumgarte(x[0], x[1]), adjoint=adjoint
+            SCENE.system,
+            diffrax.Tsit5(),
+            0.0,
+            0.5,
+            0.05,
+            SCENE.y0,
+            formulation=dae_jax.Baumgarte(x[0], x[1]),
+            adjoint=adjoint,
         )
         return jnp.sum(sol.ys[0])
 
@@ -94,7 +101,8 @@ def test_gradient_with_respect_to_baumgartes_parameters():
     h = 1e-4
     value = lambda x: end(x, diffrax.RecursiveCheckpointAdjoint())
     central = jnp.stack([(value(x + h * e) - value(x - h * e)) / (2 * h) for e in jnp.eye(2)])
-    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
+    # The derivatives are 1e-7 of a state of size 1: its round-off is what is left.
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-15)
     np.testing.assert_allclose(reverse, central, rtol=1e-5, atol=1e-12)
 
 
@@ -106,7 +114,9 @@ def test_symmetric_projection_goes_back_to_where_it_came_from():
         np.testing.assert_allclose(a[-1], b, atol=1e-12)
 
 
-@pytest.mark.parametrize("solver", [dae_jax.OrthogonalProjection(dae_jax.DOP853()), dae_jax.TangentSpace(diffrax.Tsit5())])
+@pytest.mark.parametrize(
+    "solver", [dae_jax.OrthogonalProjection(dae_jax.DOP853()), dae_jax.TangentSpace(diffrax.Tsit5())]
+)
 def test_backwards_in_time_with_a_constraint_that_depends_on_time(solver):
     scene = dae_jax.scenes.moving_pivot_pendulum()
     q, v = (x[0] for x in scene.reference(np.array([2.0])))

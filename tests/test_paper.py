@@ -22,7 +22,7 @@ def test_differentiation_drifts_off_quadratically():
     sol = dae_jax.daesolve(
         scene.system, diffrax.Tsit5(), 0.0, 100.0, 0.02, scene.y0, saveat=diffrax.SaveAt(ts=times), max_steps=100_000
     )
-    position, velocity = dae_jax.drift(scene.system, sol)
+    position = dae_jax.drift(scene.system, sol).position
     slopes = np.diff(np.log(position)) / np.log(2)
     assert np.all((slopes > 1.7) & (slopes < 2.3))
     assert position[-1] > 100 * 1e-9
@@ -30,9 +30,9 @@ def test_differentiation_drifts_off_quadratically():
 
 def test_energy_grows_under_projected_euler_only():
     times = np.linspace(0, 100, 1001)
-    euler = speeds(dae_jax.OrthogonalProjection(diffrax.Euler()), 0.005, 100.0, times)
+    euler = speeds(dae_jax.OrthogonalProjection(diffrax.Euler()), 0.005, 10.0, np.linspace(0, 10, 501))
     symmetric = speeds(dae_jax.SymmetricProjection(dae_jax.Trapezoid()), 0.02, 100.0, times)
-    assert euler[500] > euler[0] + 1
+    assert euler[-1] > euler[0] + 1
     first, last = symmetric[:250], symmetric[-250:]
     # No secular trend: the mean of the last quarter is that of the first, to a tenth of the oscillation.
     assert abs(first.mean() - last.mean()) < 0.1 * np.ptp(symmetric)
@@ -62,7 +62,14 @@ def test_baumgartes_drift_follows_its_characteristic_polynomial(alpha, beta):
 def test_a_stiff_choice_of_baumgartes_parameters_still_solves():
     scene = double_pendulum()
     sol = dae_jax.daesolve(
-        scene.system, diffrax.Tsit5(), 0.0, 2.0, None, scene.y0, formulation=dae_jax.Baumgarte(100.0, 1000.0), max_steps=100_000
+        scene.system,
+        diffrax.Tsit5(),
+        0.0,
+        2.0,
+        None,
+        scene.y0,
+        formulation=dae_jax.Baumgarte(100.0, 1000.0),
+        max_steps=100_000,
     )
     exact = scene.reference(np.array([2.0]))
     np.testing.assert_allclose(sol.ys[0], exact[0], atol=1e-5)
@@ -75,16 +82,16 @@ CHARTLESS = [dae_jax.OrthogonalProjection(diffrax.Dopri8()), dae_jax.TangentSpac
 @pytest.mark.parametrize(("name", "t1", "tolerance"), [("pendulum", 10.0, 1e-8), ("double-pendulum", 5.0, 1e-7)])
 def test_accuracy_at_1e_10(name, t1, tolerance, solver):
     scene = SCENES[name]()
-    formulation = dae_jax.StateSpace(scene.chart) if isinstance(solver, diffrax.Dopri8) else None
-    times = np.linspace(0, t1, 101)
+    formulation = dae_jax.StateSpace(scene.chart) if type(solver) is diffrax.Dopri8 else None
     sol = dae_jax.daesolve(
-        scene.system, solver, 0.0, t1, None, scene.y0, formulation=formulation, saveat=diffrax.SaveAt(ts=times),
+        scene.system, solver, 0.0, t1, None, scene.y0, formulation=formulation, saveat=diffrax.SaveAt(steps=True),
         stepsize_controller=diffrax.PIDController(1e-10, 1e-10),
     )  # fmt: skip
-    for found, exact in zip(sol.ys, scene.reference(times), strict=True):
-        assert np.abs(np.asarray(found) - exact).max() < tolerance
+    taken = np.isfinite(sol.ts)
+    for found, exact in zip(sol.ys, scene.reference(np.asarray(sol.ts)[taken]), strict=True):
+        assert np.abs(np.asarray(found)[taken] - exact).max() < tolerance
     off = dae_jax.drift(scene.system, sol)
-    assert max(off.position.max(), off.velocity.max()) <= 1e-13
+    assert max(off.position[taken].max(), off.velocity[taken].max()) <= 1e-13
 
 
 @pytest.mark.parametrize("name", sorted(SCENES))
@@ -109,7 +116,8 @@ def test_the_double_pendulums_reference_has_the_published_digits():
 def test_redundant_constraints_give_multipliers_of_least_norm():
     plain, redundant = SCENES["four-bar"](), SCENES["four-bar-redundant"]()
     a, b = (
-        dae_jax.daesolve(s.system, diffrax.Tsit5(), 0.0, 0.1, None, s.y0, saveat=diffrax.SaveAt(t0=True)) for s in (plain, redundant)
+        dae_jax.daesolve(s.system, diffrax.Tsit5(), 0.0, 0.1, None, s.y0, saveat=diffrax.SaveAt(t0=True))
+        for s in (plain, redundant)
     )
     assert b.rank == 3
     few, many = (np.asarray(dae_jax.multipliers(s.system, x))[0] for s, x in ((plain, a), (redundant, b)))
@@ -120,7 +128,7 @@ def test_redundant_constraints_give_multipliers_of_least_norm():
 def test_the_pendulums_reference_satisfies_its_equation(rate):
     scene = pendulum(angle=0.4, angular_velocity=rate)
     h, times = 1e-4, np.linspace(0.1, 4, 20)
-    q, v = scene.reference(times)
+    q = scene.reference(times)[0]
     before, after = scene.reference(times - h)[1], scene.reference(times + h)[1]
     tangent = np.stack([q[:, 1], -q[:, 0]], 1)
     acceleration = np.sum((after - before) / (2 * h) * tangent, 1)

@@ -41,7 +41,7 @@ class Baumgarte(AbstractFormulation):
     def field(self, t: Any, y: Any, ode: Any) -> Any:
         return ode.field(t, y, self)
 
-    def __call__(self, *levels: Float[Array, " m"]) -> Float[Array, " m"]:
+    def __call__(self, *levels: Float[Array, " m"]) -> Any:
         """What is added to the highest derivative of a constraint, given the constraint and its lower derivatives."""
         if len(levels) == 1:
             return self.alpha * levels[0]

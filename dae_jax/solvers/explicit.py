@@ -55,6 +55,10 @@ class Unrolled(diffrax.AbstractWrappedSolver):
     def interpolation_cls(self) -> Any:
         return self.solver.interpolation_cls
 
+    @property
+    def scan_kind(self) -> Any:
+        return self.solver.scan_kind
+
     def order(self, terms: Any) -> Any:
         return self.solver.order(terms)
 

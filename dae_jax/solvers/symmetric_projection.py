@@ -47,12 +47,12 @@ class SymmetricProjection(AbstractManifoldSolver):
     def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any) -> Any:
         tableau = self.solver.tableau
         flat, unravel = ravel_pytree(y0)
-        sign = clock(terms, t0, t1)
         levels = jax.eval_shape(args.invariants, t0, y0)
         stages = len(tableau.implicit) * flat.size
 
         def residual(x: Any, params: Any) -> Any:
             terms, args, t0, t1, y0 = params
+            sign = clock(terms, t0, t1)
             z, y1, mu = x[:stages], unravel(x[stages : stages + flat.size]), x[stages + flat.size :]
             start = args.shift(y0, args.normals(sign * t0, y0), mu)
             end = stage_end(tableau, terms, args, t0, t1, start, z)
