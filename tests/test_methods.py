@@ -106,6 +106,37 @@ def test_gradient_with_respect_to_baumgartes_parameters():
     np.testing.assert_allclose(reverse, central, rtol=1e-5, atol=1e-12)
 
 
+COMPOSED = {
+    "jit(vmap(grad))": lambda f, a: jax.jit(jax.vmap(jax.grad(lambda x: f(x, diffrax.RecursiveCheckpointAdjoint()))))(
+        a
+    ),
+    "grad(vmap)": lambda f, a: jax.grad(
+        lambda a: jax.vmap(lambda x: f(x, diffrax.RecursiveCheckpointAdjoint()))(a).sum()
+    )(a),
+    "vmap(jit(grad))": lambda f, a: jax.vmap(jax.jit(jax.grad(lambda x: f(x, diffrax.RecursiveCheckpointAdjoint()))))(
+        a
+    ),
+    "vmap(jacfwd)": lambda f, a: jax.vmap(jax.jacfwd(lambda x: f(x, diffrax.ForwardMode())))(a),
+    "jvp(vmap)": lambda f, a: jax.jvp(
+        lambda a: jax.vmap(lambda x: f(x, diffrax.ForwardMode()))(a), (a,), (jnp.ones_like(a),)
+    )[1],
+    "vmap(grad) direct": lambda f, a: jax.vmap(jax.grad(lambda x: f(x, diffrax.DirectAdjoint())))(a),
+}
+
+
+@pytest.mark.parametrize("name", COMPOSED)
+def test_transformations_compose_in_any_order(name):
+    def end(angle, adjoint):
+        y0 = (jnp.stack([jnp.sin(angle), jnp.cos(angle)]), jnp.zeros(2))
+        solver = dae_jax.OrthogonalProjection(diffrax.Tsit5())
+        return dae_jax.daesolve(SCENE.system, solver, 0.0, 0.5, 0.05, y0, adjoint=adjoint).ys[0][-1, 0]
+
+    angles, h = jnp.array([0.5, 1.0]), 1e-5
+    value = lambda a: end(a, diffrax.RecursiveCheckpointAdjoint())
+    central = [(value(a + h) - value(a - h)) / (2 * h) for a in angles]
+    np.testing.assert_allclose(COMPOSED[name](end, angles), central, rtol=1e-7)
+
+
 def test_symmetric_projection_goes_back_to_where_it_came_from():
     method = dae_jax.SymmetricProjection(dae_jax.Trapezoid())
     there = dae_jax.daesolve(SCENE.system, method, 0.0, 1.0, 0.02, SCENE.y0)

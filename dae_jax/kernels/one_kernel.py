@@ -195,7 +195,7 @@ def _fused(fn: Callable[..., Any]) -> Callable[..., Any]:
                 varies[:] = [getattr(o, "batch_dim", None) is not None for o in out]
                 return out
 
-            out = _compile(jax.vmap(lane, in_axes=axes, axis_size=axis_size), xs)
+            out = _compile(jax.vmap(lane, in_axes=axes, axis_size=axis_size), xs, batched=True)
             return [o if v else o[0] for o, v in zip(out, varies, strict=True)], varies
 
         out = call(*leaves)
@@ -204,10 +204,11 @@ def _fused(fn: Callable[..., Any]) -> Callable[..., Any]:
     return traced
 
 
-def _compile(fn: Callable[..., Any], args: Any) -> Any:
+def _compile(fn: Callable[..., Any], args: Any, batched: bool = False) -> Any:
     jaxpr = jax.make_jaxpr(without_checks(fn))(*args)
     call = jax.jit(jaxpr_as_fun(jaxpr))
-    if hindrances(jaxpr):
+    # Of the scatters only the update of one row becomes a copy, and that for certain only where nothing is batched.
+    if hindrances(jaxpr) or (batched and any(e.primitive.name.startswith("scatter") for e in _equations(jaxpr))):
         return call(*args)
     with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
         return call(*args)
