@@ -50,7 +50,7 @@ def _compare(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> 
     print(f"{scene.name}, {t1:g} s, tolerance {arguments.rtol:g}; error and drifts are the largest over 501 times")
     print(table(rows))
     solutions = {row.method: sol for row, sol in results if sol is not None}
-    folder = arguments.out or Path(f"compare-{scene.name}")
+    folder = arguments.out or Path(f"compare-{arguments.scene}")
     for path in write(scene, rows, solutions, arguments.rtol, folder):
         print(path)
     return 0

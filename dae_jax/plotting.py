@@ -1,4 +1,7 @@
-"""Figures. The only module that imports matplotlib, and only when a figure is drawn."""
+"""Figures. The only module that imports matplotlib, and only when a figure is drawn.
+
+Every function returns a `matplotlib.figure.Figure` and leaves pyplot's state alone. `curves` maps a label to (x, y).
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -6,77 +9,131 @@ from typing import Any
 import numpy as np
 
 
-# Okabe and Ito's colours, told apart by colour-blind readers too.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
+Curves = Mapping[str, tuple[np.ndarray, np.ndarray]]
+
+# Okabe and Ito's colours, told apart by colour-blind readers too; markers tell apart what shares a colour or a line.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+MARKERS = "osD^vPX<>*hp"
+GREY = "#999999"
+# What is below is round-off of round-off; a log axis needs a floor.
+FLOOR = 1e-17
 
 
-def _figure(width: float = 6.4, height: float = 4.0) -> tuple[Any, Any]:
+def _figure(width: float = 7.2, height: float = 4.4) -> tuple[Any, Any]:
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), layout="constrained", dpi=150)
+    figure = Figure(figsize=(width, height), layout="constrained", dpi=200)
     axes = figure.subplots()
     axes.grid(alpha=0.3, linewidth=0.5)
     return figure, axes
 
 
-def _curves(
-    axes: Any, curves: Mapping[str, tuple[np.ndarray, np.ndarray]], plot: str, floor: float | None = None
-) -> None:
+def _legend_beside(figure: Any) -> None:
+    figure.legend(loc="outside right upper", frameon=False, fontsize="small")
+
+
+def _legend_below(figure: Any, columns: int = 2) -> None:
+    figure.legend(loc="outside lower center", ncols=columns, frameon=False, fontsize="small")
+
+
+def _look(i: int) -> dict[str, Any]:
+    """Colour and marker of the i-th curve."""
+    return {"color": COLOURS[i % len(COLOURS)], "marker": MARKERS[i % len(MARKERS)], "markersize": 4, "linewidth": 1.2}
+
+
+def _marked(axes: Any, curves: Curves) -> None:
+    """Curves with a few markers each, at other places for each, so that curves on top of each other can be told apart."""
     for i, (label, (x, y)) in enumerate(curves.items()):
-        y = np.asarray(y) if floor is None else np.maximum(y, floor)
-        style = "-" if i < len(COLOURS) else "--"
-        getattr(axes, plot)(np.asarray(x), y, style, color=COLOURS[i % len(COLOURS)], linewidth=1.2, label=label)
+        every = max(len(x) // 8, 1)
+        axes.plot(x, y, label=label, markevery=(every * (i + 1) // (len(curves) + 1), every), **_look(i))
 
 
-def drift(curves: Mapping[str, tuple[np.ndarray, np.ndarray]], title: str = "Drift off the constraints") -> Any:
-    """The largest constraint violation max |g| over time on a log axis; `curves` maps a label to (times, drift).
+def drift(curves: Curves, title: str = "Drift off the constraints", unit: str = "") -> Any:
+    """The largest constraint violation until each time, on a log axis; `curves` maps a label to (times, max |g|).
 
     What is below 1e-17 is drawn there.
     """
-    figure, axes = _figure(7.2)
-    _curves(axes, curves, "semilogy", 1e-17)
-    axes.set(xlabel="time in s", ylabel="max |g|", title=title)
-    figure.legend(loc="outside right upper", frameon=False, fontsize="small")
-    return figure
-
-
-def over_time(curves: Mapping[str, tuple[np.ndarray, np.ndarray]], quantity: str, title: str = "") -> Any:
-    """Any quantity over time; `quantity` labels its axis, with the unit."""
-    figure, axes = _figure(7.2)
-    _curves(axes, curves, "plot")
-    axes.set(xlabel="time in s", ylabel=quantity, title=title)
-    figure.legend(loc="outside right upper", frameon=False, fontsize="small")
-    return figure
-
-
-def phase_portrait(curves: Mapping[str, tuple[np.ndarray, np.ndarray]], position: str, velocity: str) -> Any:
-    """Velocity over position; `curves` maps a label to (positions, velocities)."""
     figure, axes = _figure()
-    _curves(axes, curves, "plot")
-    axes.set(xlabel=position, ylabel=velocity, title="Phase portrait")
-    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize="small")
+    _marked(axes, {k: (np.asarray(t), np.maximum.accumulate(np.maximum(g, FLOOR))) for k, (t, g) in curves.items()})
+    axes.set(xlabel="time in s", ylabel=f"largest |g| so far{unit and ' in ' + unit}", title=title, yscale="log")
+    _legend_beside(figure)
+    return figure
+
+
+def drift_growth(curves: Curves, title: str = "", unit: str = "", power: int = 2) -> Any:
+    """As `drift`, with both axes logarithmic and a line that grows with a power of time to compare with."""
+    figure, axes = _figure()
+    for i, (label, (t, g)) in enumerate(curves.items()):
+        t, g = np.asarray(t)[1:], np.asarray(g)[1:]
+        axes.loglog(t, np.maximum(g, FLOOR), color=COLOURS[i % len(COLOURS)], linewidth=1.4, label=label)
+        guide = 2 * g[-1] * (t / t[-1]) ** power
+        late = t > t[-1] / 30
+        axes.loglog(t[late], guide[late], "--", color=GREY, linewidth=1, label=None if i else f"∝ time$^{power}$")
+    axes.set(xlabel="time in s", ylabel=f"max |g|{unit and ' in ' + unit}", title=title)
+    _legend_below(figure, 4)
+    return figure
+
+
+def energy(curves: Curves, title: str = "Energy", unit: str = "J") -> Any:
+    """The largest change of the energy until each time, on a log axis; `curves` maps a label to (times, energies)."""
+    figure, axes = _figure()
+    change = {}
+    for label, (times, values) in curves.items():
+        off = np.abs(np.asarray(values) - values[0])
+        change[label] = (np.asarray(times), np.maximum.accumulate(np.maximum(off, FLOOR)))
+    _marked(axes, change)
+    axes.set(xlabel="time in s", ylabel=f"largest |E − E(0)| so far in {unit}", title=title, yscale="log")
+    _legend_beside(figure)
+    return figure
+
+
+def over_time(curves: Curves, quantity: str, title: str = "", exact: str | None = None) -> Any:
+    """Any quantity over time; `quantity` labels its axis, with the unit.
+
+    The curve called `exact` is drawn wide and grey behind the others, so that what agrees with it stays visible.
+    """
+    figure, axes = _figure()
+    if exact is not None:
+        axes.plot(*curves[exact], color=GREY, alpha=0.6, linewidth=4, label=exact)
+    others = {k: xy for k, xy in curves.items() if k != exact}
+    for i, (label, (x, y)) in enumerate(others.items()):
+        axes.plot(
+            x, y, color=COLOURS[i % len(COLOURS)], linewidth=1.4, linestyle=("-", "--", "-.", ":")[i % 4], label=label
+        )
+    axes.set(xlabel="time in s", ylabel=quantity, title=title)
+    _legend_below(figure, 3)
+    return figure
+
+
+def phase_portrait(curves: Curves, position: str, velocity: str, title: str = "Phase portrait") -> Any:
+    """Velocity over position; `curves` maps a label to (positions, velocities), later ones on top."""
+    figure, axes = _figure(6.4)
+    for i, (label, (x, y)) in enumerate(curves.items()):
+        axes.plot(x, y, color=COLOURS[i % len(COLOURS)], linewidth=1 if i == 0 else 2, label=label)
+    axes.set(xlabel=position, ylabel=velocity, title=title)
+    _legend_below(figure)
     return figure
 
 
 def trajectory(times: np.ndarray, path: np.ndarray, first: float = 10.0, title: str = "") -> Any:
     """A path in the plane, `path` of shape (times, 2) with y pointing down: until `first` in red, then in black."""
-    figure, axes = _figure(5.0, 5.0)
-    early = np.asarray(times) <= first
-    late = np.asarray(times) >= first
+    figure, axes = _figure(5.4, 5.4)
+    times, path = np.asarray(times), np.asarray(path)
+    early, late = times <= first, times >= first
+    axes.plot(*path[early].T, color="#D00000", linewidth=1.3, zorder=3, label=f"0 to {min(first, times[-1]):g} s")
     if late.sum() > 1:
-        axes.plot(*path[late].T, color="black", linewidth=0.4, label=f"{first:g} to {times[-1]:g} s")
-    axes.plot(*path[early].T, color="#D00000", linewidth=1.2, label=f"0 to {min(first, times[-1]):g} s")
-    axes.set(xlabel="x in m", ylabel="y in m", title=title, aspect="equal")
+        axes.plot(*path[late].T, color="black", linewidth=0.4, zorder=2, label=f"{first:g} to {times[-1]:g} s")
+    axes.set(xlabel="x in m", ylabel="y in m, downwards", title=title, aspect="equal")
     axes.invert_yaxis()
-    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize="small")
+    _legend_below(figure)
     return figure
 
 
-def work_precision(points: Mapping[str, tuple[Sequence[float], Sequence[float]]]) -> Any:
+def work_precision(points: Mapping[str, tuple[Sequence[float], Sequence[float]]], title: str = "") -> Any:
     """Error against run time on log axes; `points` maps a label to (run times in s, errors)."""
-    figure, axes = _figure(7.2)
+    figure, axes = _figure()
     for i, (label, (times, errors)) in enumerate(points.items()):
-        axes.loglog(times, errors, "o-", color=COLOURS[i % len(COLOURS)], markersize=3, linewidth=1, label=label)
-    axes.set(xlabel="run time in s", ylabel="error", title="Work and precision")
-    figure.legend(loc="outside right upper", frameon=False, fontsize="small")
+        axes.loglog(times, errors, label=label, **_look(i))
+    axes.set(xlabel="run time in s", ylabel="largest error against the reference", title=title)
+    _legend_beside(figure)
     return figure
