@@ -63,6 +63,8 @@ def daesolve(
     y0, args = _checked(system, t0, t1, dt0, y0, args)
     formulation = Differentiation() if formulation is None else formulation
     _fits(system, formulation, solver)
+    if isinstance(solver, RATTLE):
+        _fits_rattle(system, formulation, t0, y0, args)
     dtype = jnp.result_type(*jax.tree.leaves(y0))
     if stepsize_controller is None:
         stepsize_controller = _default_controller(solver, dt0, dtype)
@@ -135,17 +137,22 @@ def _fits(system: ConstrainedSystem, formulation: Any, solver: Any) -> None:
             f"StateSpace has no constraints left for {type(solver).__name__} to keep: in its chart they hold by "
             "construction. Use the inner solver itself."
         )
-    if isinstance(solver, RATTLE):
-        _fits_rattle(system, formulation)
 
 
-def _fits_rattle(system: ConstrainedSystem, formulation: Any) -> None:
+def _fits_rattle(system: ConstrainedSystem, formulation: Any, t0: Any, y0: Any, args: Any) -> None:
     if callable(system.mass):
         raise ValueError("RATTLE needs a constant mass matrix, but `mass` is a function; use SymmetricProjection.")
     if system.nonholonomic is not None:
         raise ValueError("RATTLE takes holonomic constraints only; use SymmetricProjection for nonholonomic ones.")
     if not isinstance(formulation, Differentiation):
         raise ValueError(f"RATTLE has its own treatment of the constraints and takes no {type(formulation).__name__}.")
+    q, v = y0
+    arrays, static = eqx.partition(args, eqx.is_array)
+    jaxpr = jax.make_jaxpr(lambda v, q, a: system.force(t0, q, v, eqx.combine(a, static)))(v, q, arrays).jaxpr
+    velocities = jaxpr.invars[: len(jax.tree.leaves(v))]
+    used = [x for eqn in jaxpr.eqns for x in eqn.invars] + list(jaxpr.outvars)
+    if any(x is velocity for x in used for velocity in velocities):
+        raise ValueError("RATTLE needs a force that does not depend on v; use SymmetricProjection.")
 
 
 def _default_controller(solver: Any, dt0: Any, dtype: Any) -> Any:
@@ -278,7 +285,7 @@ class _Solve(eqx.Module):
             self.formulation.term(),
             _economical(self.solver, between),
             t0, t1, dt0, y,
-            args=ode, saveat=saveat, stepsize_controller=self.controller, adjoint=self.adjoint, event=event,
+            args=ode, saveat=saveat, stepsize_controller=_floored(self.controller, t0, t1), adjoint=self.adjoint, event=event,
             max_steps=self.max_steps, throw=False, progress_meter=self.progress_meter,
         )  # fmt: skip
         interpolation = None
