@@ -62,7 +62,7 @@ def daesolve(
     """
     y0, args = _checked(system, t0, t1, dt0, y0, args)
     formulation = Differentiation() if formulation is None else formulation
-    _fits(system, formulation, solver)
+    _fits(formulation, solver)
     if isinstance(solver, RATTLE):
         _fits_rattle(system, formulation, t0, y0, args)
     dtype = jnp.result_type(*jax.tree.leaves(y0))
@@ -124,7 +124,7 @@ def _brief(x: Any) -> str:
     return text if len(text) < 200 else text[:200] + "…"
 
 
-def _fits(system: ConstrainedSystem, formulation: Any, solver: Any) -> None:
+def _fits(formulation: Any, solver: Any) -> None:
     """Refuses pairs of formulation and solver that make no sense, and shapes that do not fit."""
     if not isinstance(solver, diffrax.AbstractSolver):
         raise TypeError(f"`solver` must be a diffrax solver such as diffrax.Tsit5(), but is {_brief(solver)}.")
