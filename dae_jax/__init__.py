@@ -21,4 +21,8 @@ from .solvers import (
     TangentSpace as TangentSpace,
     Trapezoid as Trapezoid,
 )
-from .systems import ConstrainedSystem as ConstrainedSystem
+from .systems import (
+    ConstrainedSystem as ConstrainedSystem,
+    ImplicitDAE as ImplicitDAE,
+    SemiExplicitDAE as SemiExplicitDAE,
+)

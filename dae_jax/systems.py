@@ -47,10 +47,8 @@ class ConstrainedSystem(eqx.Module):
     rank: int | None = eqx.field(static=True, default=None)
 
     def __check_init__(self) -> None:
-        for name in ("force", "constraint", "nonholonomic", "potential"):
-            function = getattr(self, name)
-            if not callable(function) and not (function is None and name != "force"):
-                raise TypeError(f"`{name}` must be a function, but is {function!r}.")
+        optional = ("constraint", "nonholonomic", "potential")
+        _require_functions(self, "force", *(name for name in optional if getattr(self, name) is not None))
         if self.constraint is None and self.nonholonomic is None:
             raise TypeError(
                 "A ConstrainedSystem needs a `constraint` or a `nonholonomic` constraint; "
@@ -65,3 +63,54 @@ class ConstrainedSystem(eqx.Module):
         if isinstance(mass, jax.Array | np.ndarray | float | int):
             return jnp.asarray(mass)
         return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(mass)])
+
+
+class SemiExplicitDAE(eqx.Module):
+    """A semi-explicit system,
+
+        ẋ = f(t, x, z),
+        0 = g(t, x, z),
+
+    of index 1 where ∂g/∂z is regular, of a higher index otherwise. The state is the pair (x, z); both are any pytree of
+    arrays.
+
+    **Arguments**
+
+    - `f(t, x, z, args)`: with the structure of x.
+    - `g(t, x, z, args)`: any pytree with as many numbers as z.
+
+    Source: U. M. Ascher, L. R. Petzold, *Computer Methods for Ordinary Differential Equations and
+    Differential-Algebraic Equations*, eq. 9.2.
+    """
+
+    f: Callable[..., Any]
+    g: Callable[..., Any]
+
+    def __check_init__(self) -> None:
+        _require_functions(self, "f", "g")
+
+
+class ImplicitDAE(eqx.Module):
+    """A fully implicit system, 0 = F(t, y, ẏ), of any index. The state y is any pytree of arrays.
+
+    **Arguments**
+
+    - `residual(t, y, yd, args)`: F, any pytree with as many numbers as y; `yd` is ẏ, with the structure of y.
+
+    Source: K. E. Brenan, S. L. Campbell, L. R. Petzold, *Numerical Solution of Initial-Value Problems in
+    Differential-Algebraic Equations*, eq. 1.1.1.
+    """
+
+    residual: Callable[..., Any]
+
+    def __check_init__(self) -> None:
+        _require_functions(self, "residual")
+
+
+System = ConstrainedSystem | SemiExplicitDAE | ImplicitDAE
+
+
+def _require_functions(system: eqx.Module, *names: str) -> None:
+    for name in names:
+        if not callable(getattr(system, name)):
+            raise TypeError(f"`{name}` must be a function, but is {getattr(system, name)!r}.")

@@ -12,7 +12,7 @@ import pytest
 PACKAGE = Path(__file__).parent.parent / "dae_jax"
 LAYERS = (
     {"kernels", "linalg", "structure"},
-    {"constraints", "initialise", "systems"},
+    {"constraints", "initialise", "residual", "systems"},
     {"formulations", "solvers"},
     {"diagnostics", "solution", "solve"},
     {"compare", "plotting", "scenes", "sweep", "tune"},

@@ -1,0 +1,131 @@
+"""Any system as 0 = F(t, y, ẏ) on flat vectors: what structural analysis and the solvers of residuals see."""
+
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .constraints import MechanicalODE, at_one_instant
+from .structure.layout import Layout
+from .systems import ConstrainedSystem, ImplicitDAE, SemiExplicitDAE, System
+
+
+Form = Literal["index-3", "index-2", "GGL"]
+
+
+class ResidualForm(eqx.Module):
+    """0 = F(t, y, ẏ). For a `ConstrainedSystem`, in the given form, y = (q, v, λ) or (q, v, λ, η) and
+
+        index-3:  0 = q̇ − v,            0 = M v̇ − f + Aᵀλ,   0 = (g, h);
+        index-2:  0 = q̇ − v,            0 = M v̇ − f + Aᵀλ,   0 = (G v + g_t, h);
+        GGL:      0 = q̇ − v + M⁻¹Gᵀη,   0 = M v̇ − f + Aᵀλ,   0 = (G v + g_t, h),   0 = g,
+
+    for a `SemiExplicitDAE` y = (x, z) and F = (ẋ − f, g).
+
+    Source of GGL: C. W. Gear, B. Leimkuhler, G. K. Gupta, J. Comput. Appl. Math. 12–13 (1985), 77–90.
+    """
+
+    system: System
+    args: Any
+    form: Form = eqx.field(static=True)
+    layout: Layout = eqx.field(static=True)
+    extra: int = eqx.field(static=True)
+    equations: tuple[str, ...] = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, system: System, t: Any, state: Any, args: Any, form: Form = "index-3") -> "ResidualForm":
+        """The residual of `system`; `state` gives shapes only."""
+        layout = Layout.of(state)
+        if isinstance(system, ConstrainedSystem):
+            ode = MechanicalODE.of(system, t, state, args)
+            names = ode.layout.names()
+            rows = [f"constraint[{i}]" for i in range(ode.holonomic)]
+            rolls = [f"nonholonomic[{i}]" for i in range(ode.nonholonomic)]
+            dots = [f"d/dt {row}" for row in rows]
+            levels = rows if form == "index-3" else dots
+            equations = [f"dq/dt − v{n}" for n in names] + [f"force{n}" for n in names] + levels + rolls
+            equations += rows if form == "GGL" else []
+            extra = ode.holonomic * (2 if form == "GGL" else 1) + ode.nonholonomic
+            return cls(system, args, form, layout, extra, tuple(equations))
+        if isinstance(system, SemiExplicitDAE):
+            x, z = state
+            out = jax.eval_shape(lambda: system.g(t, x, z, args))
+            equations = tuple(f"dx/dt − f{n}" for n in Layout.of(x).names()) + _names("g", out)
+        else:
+            out = jax.eval_shape(lambda: system.residual(t, state, state, args))
+            equations = _names("residual", out)
+        if len(equations) != layout.size:
+            raise ValueError(
+                f"A {type(system).__name__} must have as many equations as unknowns, but has {len(equations)} equations "
+                f"for {layout.size} unknowns."
+            )
+        return cls(system, args, form, layout, 0, equations)
+
+    @property
+    def size(self) -> int:
+        """The number of unknowns."""
+        return self.layout.size + self.extra
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """A name for each unknown."""
+        if isinstance(self.system, ImplicitDAE):
+            return tuple(f"y{n}" for n in self.layout.names())
+        letters = ("q", "v") if isinstance(self.system, ConstrainedSystem) else ("x", "z")
+        names = [letters[int(n[1])] + n[3:] for n in self.layout.names()]
+        multipliers = [f"multiplier[{i}]" for i in range(self.extra)]
+        return (*names, *multipliers)
+
+    def encode(self, state: Any) -> Float[Array, " n"]:
+        """The flat vector of a state, multipliers 0."""
+        y = self.layout.flatten(state)
+        return jnp.concatenate([y, jnp.zeros(self.extra, y.dtype)]) if self.extra else y
+
+    def decode(self, t: Any, y: Float[Array, " n"]) -> Any:
+        """The state in the user's structure."""
+        return self.layout.unflatten(y[: self.layout.size])
+
+    @at_one_instant
+    def residual(self, t: Any, y: Float[Array, " n"], yd: Float[Array, " n"]) -> Float[Array, " n"]:
+        """F(t, y, ẏ)."""
+        system = self.system
+        if isinstance(system, ConstrainedSystem):
+            return self._mechanical(t, y, yd)
+        state, rates = self.layout.unflatten(y), self.layout.unflatten(yd)
+        if isinstance(system, ImplicitDAE):
+            return _flat(system.residual(t, state, rates, self.args), y.dtype)
+        (x, z), (xd, _) = state, rates
+        f = system.f(t, x, z, self.args)
+        return jnp.concatenate([_flat(xd, y.dtype) - _flat(f, y.dtype), _flat(system.g(t, x, z, self.args), y.dtype)])
+
+    def _mechanical(self, t: Any, y: Float[Array, " n"], yd: Float[Array, " n"]) -> Float[Array, " n"]:
+        assert isinstance(self.system, ConstrainedSystem)
+        ode = MechanicalODE.of(self.system, t, self.layout.unflatten(y[: self.layout.size]), self.args)
+        n, m, p = ode.layout.size, ode.holonomic, ode.nonholonomic
+        q, v, multipliers = y[:n], y[n : 2 * n], y[2 * n : 2 * n + m + p]
+        a, mass = ode.constraint_jacobian(t, q, v), ode.mass(q)
+        inertia = yd[n : 2 * n] if mass is None else mass * yd[n : 2 * n] if mass.ndim < 2 else mass @ yd[n : 2 * n]
+        momentum = inertia - ode.force(t, q, v) + multipliers @ a
+        velocity = ode.velocity_constraint(t, q, v)
+        kinematics = yd[:n] - v
+        if self.form == "index-3":
+            return jnp.concatenate([kinematics, momentum, ode.constraint(t, q), velocity[m:]])
+        if self.form == "index-2":
+            return jnp.concatenate([kinematics, momentum, velocity])
+        normals = ode.normals(t, (q, v))[1]
+        return jnp.concatenate(
+            [kinematics + normals[:, :m] @ y[2 * n + m + p :], momentum, velocity, ode.constraint(t, q)]
+        )
+
+
+def _names(stem: str, out: Any) -> tuple[str, ...]:
+    shapes = jax.tree.map(lambda s: np.zeros(s.shape), out)
+    return tuple(stem + name for name in Layout.of(shapes).names())
+
+
+def _flat(tree: Any, dtype: Any) -> Float[Array, " n"]:
+    leaves = [jnp.ravel(jnp.asarray(leaf, dtype)) for leaf in jax.tree.leaves(tree)]
+    return jnp.concatenate(leaves) if len(leaves) > 1 else leaves[0]
