@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .kernels import scalarise
+from .kernels import scalarise, subroutine
 from .linalg import fixed_point, implicit_root, relative_change, semidefinite_solve, solve
 from .structure.layout import Layout
 from .systems import ConstrainedSystem
@@ -37,7 +37,7 @@ def at_one_instant(method: Callable[..., Any]) -> Callable[..., Any]:
     return wrapped
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+@functools.partial(subroutine, static_argnums=(0, 1, 2))
 def _evaluate(method: Callable[..., Any], leaves: tuple[Any, ...], treedef: Any, arrays: Any) -> Any:
     static = jax.tree.unflatten(treedef, leaves)
     return scalarise(lambda arrays: method(*eqx.combine(arrays, static)))(arrays)
@@ -71,6 +71,10 @@ class ManifoldODE(eqx.Module):
     @abc.abstractmethod
     def restore(self, t: Any, y: Any, normals: Any) -> tuple[Any, Bool[Array, ""]]:
         """The point y + N μ on the manifold at time t, and whether it was found."""
+
+    def project(self, t: Any, y: Any) -> tuple[Any, Bool[Array, ""]]:
+        """The nearest point on the manifold at time t, with the normals at y itself, and whether it was found."""
+        return self.restore(t, y, self.normals(t, y))
 
     @abc.abstractmethod
     def tangent(self, dy: Any, normals: Any) -> Any:
@@ -241,19 +245,29 @@ class MechanicalODE(ManifoldODE):
         return q + _matvec(n[:, :m], mu[:m]), v + _matvec(n, mu[m:])
 
     def restore(self, t: Any, y: Any, normals: Any) -> tuple[Any, Bool[Array, ""]]:
-        q, v = y
-        m = self.holonomic
-        params = (self, t, y, normals)
+        q, _ = y
+        zero = jnp.zeros(2 * self.holonomic + self.nonholonomic, q.dtype)
+        return self._restored(t, y, normals, self.correction(t, y, normals, zero))
 
+    def project(self, t: Any, y: Any) -> tuple[Any, Bool[Array, ""]]:
+        normals, *first = self._first_correction(t, y)
+        return self._restored(t, y, normals, first)
+
+    @at_one_instant
+    def _first_correction(self, t: Any, y: Any) -> tuple[Any, Float[Array, " c"], Float[Array, ""]]:
+        normals = self.normals(t, y)
+        zero = jnp.zeros(2 * self.holonomic + self.nonholonomic, y[0].dtype)
+        return normals, *self.correction(t, y, normals, zero)
+
+    def _restored(self, t: Any, y: Any, normals: Any, first: Any) -> tuple[Any, Bool[Array, ""]]:
         def iterate(params: Any) -> tuple[Float[Array, " c"], Bool[Array, ""]]:
-            ode, t, y, normals = params
-            zero = jnp.zeros(2 * m + self.nonholonomic, q.dtype)
-            return fixed_point(lambda mu: ode.correction(t, y, normals, mu), zero)
+            *point, first = params
+            return fixed_point(lambda mu: MechanicalODE.correction(*point, mu), first)
 
-        mu, converged = implicit_root(
-            _manifold_residual, iterate, params, linear_solve=solve if self.rank is None else _minimum_norm
-        )
-        return self.shift((q, v), normals, mu), converged
+        params = (self, t, y, normals, tuple(jax.lax.stop_gradient(first)))
+        linear_solve = solve if self.rank is None else _minimum_norm
+        mu, found = implicit_root(_manifold_residual, iterate, params, linear_solve=linear_solve)
+        return self.shift(y, normals, mu), found
 
     @at_one_instant
     def correction(self, t: Any, y: Any, normals: Any, mu: Float[Array, " c"]) -> tuple[Float[Array, " c"], Any]:
@@ -276,7 +290,7 @@ class MechanicalODE(ManifoldODE):
 
 
 def _manifold_residual(mu: Float[Array, " c"], params: Any) -> Float[Array, " c"]:
-    ode, t, y, normals = params
+    ode, t, y, normals, _ = params
     return jnp.concatenate(ode.invariants(t, ode.shift(y, normals, mu)))
 
 

@@ -108,7 +108,7 @@ def _nearest(ode: MechanicalODE, t: Any, y: Any, weights: Any) -> Any:
             new = _improved(x, params)
             return new, relative_change(new - x, x)
 
-        return fixed_point(correct, jnp.concatenate(params[2]), 100)
+        return fixed_point(correct, correct(jnp.concatenate(params[2])), 100)
 
     x, _ = implicit_root(lambda x, p: x - _improved(x, p), iterate, params)
     q, v = jnp.split(x, 2)

@@ -1,8 +1,9 @@
 """`daesolve`: one solve of a DAE, through `diffrax.diffeqsolve`."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -68,18 +69,79 @@ def daesolve(
     dtype = jnp.result_type(*jax.tree.leaves(y0))
     if stepsize_controller is None:
         stepsize_controller = _default_controller(solver, dt0, dtype)
-    t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
-    dt0 = None if dt0 is None else jnp.asarray(dt0, dtype)
-    saveat = jax.tree.map(lambda x: jnp.asarray(x, dtype) if isinstance(x, np.ndarray | jax.Array) else x, saveat)
-    rank = system.rank
-    checked = not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((system, t0, t1, saveat, y0, args)))
-    if checked:
-        rank = _refuse_bad_start(system, t0, t1, saveat, y0, args)
-    solve = _Solve(
-        formulation, solver, saveat, stepsize_controller, adjoint, event, max_steps, progress_meter, rank, checked
-    )
-    sol = _jitted(solve, system, t0, t1, dt0, y0, args)
+    t0, t1, dt0 = (x if x is None else _as_array(x, dtype) for x in (t0, t1, dt0))
+    saveat = jax.tree.map(lambda x: _as_array(x, dtype) if isinstance(x, np.ndarray | jax.Array) else x, saveat)
+    solve = _Solve(formulation, solver, saveat, stepsize_controller, adjoint, event, max_steps, progress_meter)
+    program, arrays = _split((solve, system, t0, t1, dt0, y0, args))
+    if any(isinstance(x, jax.core.Tracer) for x in arrays):
+        sol, _ = _run(program, system.rank, arrays)
+    else:
+        _refuse_bad_times(saveat, t0, t1)
+        if program not in _ranks:
+            _ranks[program] = _refuse_bad_start(system, t0, y0, args)
+        sol, start = _run(program, _ranks[program], arrays)
+        if not start.as_expected(sol.rank):
+            _ranks[program] = _refuse_bad_start(system, t0, y0, args)
+            sol, _ = _run(program, _ranks[program], arrays)
     return _raise_if_failed(sol) if throw else sol
+
+
+# One compiled program a system and method. `equinox.filter_jit` would do, at three times the cost of a call.
+
+
+class _Program(NamedTuple):
+    """All of a solve but its arrays: hashable, and different for 1 and 1.0."""
+
+    treedef: Any
+    leaves: tuple[Any, ...]
+    types: tuple[type, ...]
+
+    def inputs(self, arrays: list[Any]) -> Any:
+        """The inputs with these arrays."""
+        rest = iter(arrays)
+        return jax.tree.unflatten(self.treedef, [next(rest) if x is _ARRAY else x for x in self.leaves])
+
+
+_ARRAY = object()
+_ranks: dict[_Program, int | None] = {}
+
+
+def _split(inputs: Any) -> tuple[_Program, list[Any]]:
+    leaves, treedef = jax.tree.flatten(inputs)
+    arrays = [x for x in leaves if isinstance(x, jax.Array | np.ndarray | np.generic)]
+    static = tuple(_ARRAY if isinstance(x, jax.Array | np.ndarray | np.generic) else x for x in leaves)
+    return _Program(treedef, static, tuple(map(type, static))), arrays
+
+
+class _Static(eqx.Module):
+    """What a jitted function returns that is not an array."""
+
+    value: Any = eqx.field(static=True)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _jitted(program: _Program, rank: int | None, arrays: list[Any]) -> Any:
+    solve, *inputs = program.inputs(jax.tree.map(jnp.asarray, arrays))
+    (sol, start) = solve(*inputs, rank)
+    numbers, rest = eqx.partition(sol, eqx.is_array)
+    return numbers, _Static(rest), start
+
+
+def _run(program: _Program, rank: int | None, arrays: list[Any]) -> tuple[DAESolution, "_Start"]:
+    numbers, rest, start = _jitted(program, rank, arrays)
+    return eqx.combine(numbers, rest.value), start
+
+
+class _Start(eqx.Module):
+    """What a solve saw of its initial state: whether it is consistent, and how many constraints are independent."""
+
+    consistent: Any
+    rank: Any
+    constraints: int = eqx.field(static=True)
+
+    def as_expected(self, rank: int | None) -> bool:
+        """Whether it is consistent, with the rank that was counted on."""
+        return bool(self.consistent) and int(self.rank) == (self.constraints if rank is None else rank)
 
 
 # Wrong input is refused before anything is traced
@@ -115,8 +177,15 @@ def _checked(system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any) -> tup
     if dt0 is not None and not any(isinstance(x, jax.core.Tracer) for x in (t0, t1, dt0)) and (t1 - t0) * dt0 < 0:
         raise ValueError(f"`dt0` = {dt0} points away from `t1` = {t1}: it must have the sign of t1 − t0.")
     dtype = jnp.result_type(*jax.tree.leaves(y0))
-    as_array = lambda x: jnp.asarray(x) if isinstance(x, float | np.ndarray | np.generic) else x
-    return (jax.tree.map(lambda x: jnp.asarray(x, dtype), tuple(y0)), jax.tree.map(as_array, args))
+    as_array = lambda x: np.asarray(x, jnp.result_type(x)) if isinstance(x, float) else x
+    return jax.tree.map(lambda x: _as_array(x, dtype), tuple(y0)), jax.tree.map(as_array, args)
+
+
+def _as_array(x: Any, dtype: Any) -> Any:
+    """`x` as an array; numbers stay numpy's, which costs less than the way to a device and back."""
+    if isinstance(x, jax.Array):
+        return x if x.dtype == dtype else x.astype(dtype)
+    return np.asarray(x, dtype)
 
 
 def _brief(x: Any) -> str:
@@ -160,12 +229,13 @@ def _default_controller(solver: Any, dt0: Any, dtype: Any) -> Any:
         return diffrax.ConstantStepSize()
     if not isinstance(solver, diffrax.AbstractAdaptiveSolver):
         raise ValueError(f"`dt0` must be given: {type(solver).__name__} takes fixed steps.")
-    tolerance = 1e-8 if dtype == jnp.float64 else 1e-5
-    return diffrax.PIDController(rtol=tolerance, atol=tolerance)
+    return _PID64 if dtype == jnp.float64 else _PID32
 
 
-def _refuse_bad_start(system: Any, t0: Any, t1: Any, saveat: Any, y0: Any, args: Any) -> int | None:
-    """Refuses an inconsistent start in words; the rank of the constraints if some are redundant."""
+_PID64, _PID32 = (diffrax.PIDController(rtol=tolerance, atol=tolerance) for tolerance in (1e-8, 1e-5))
+
+
+def _refuse_bad_times(saveat: Any, t0: Any, t1: Any) -> None:
     for sub in _subs(saveat):
         if sub.ts is not None:
             ts = np.asarray(sub.ts)
@@ -177,6 +247,10 @@ def _refuse_bad_start(system: Any, t0: Any, t1: Any, saveat: Any, y0: Any, args:
             steps = np.diff(ts) * (1 if t1 >= t0 else -1)
             if np.any(steps < 0):
                 raise ValueError("`saveat.ts` must be in the order in which the solve passes them.")
+
+
+def _refuse_bad_start(system: Any, t0: Any, y0: Any, args: Any) -> int | None:
+    """Refuses an inconsistent start in words; the rank of the constraints if some are redundant."""
     found = _look(system, t0, y0, args)
     if not bool(found.consistent()):
         raise ValueError(
@@ -235,23 +309,25 @@ class _Solve(eqx.Module):
     event: diffrax.Event | None
     max_steps: int | None = eqx.field(static=True)
     progress_meter: diffrax.AbstractProgressMeter
-    rank: int | None = eqx.field(static=True)
-    checked: bool = eqx.field(static=True)
 
-    def __call__(self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any) -> DAESolution:
+    def __call__(
+        self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, rank: int | None
+    ) -> tuple[DAESolution, _Start]:
         inputs = (self, system, t0, t1, dt0, y0, args)
         arrays, static = eqx.partition(inputs, eqx.is_array)
         outline: list[Any] = []
 
         def numbers(arrays: Any) -> Any:
             solve, *rest = eqx.combine(arrays, static)
-            out, fixed = eqx.partition(solve._diffeqsolve(*rest), eqx.is_array)
+            out, fixed = eqx.partition(solve._diffeqsolve(*rest, rank), eqx.is_array)
             outline[:] = [fixed]
             return out
 
         out = one_kernel(numbers, self._derivative())(arrays)
-        sol = eqx.combine(out, outline[0])
-        return self._solution(sol, system, t0, y0, args)
+        ode = MechanicalODE.of(system, t0, y0, args, rank)
+        found = violation(ode, t0, ode.encode(y0))
+        sol = self._solution(eqx.combine(out, outline[0]), args, rank, found.consistent())
+        return sol, _Start(found.consistent(), found.rank, found.residuals[1].shape[0])
 
     def _derivative(self) -> Any:
         """In which mode the adjoint allows derivatives; a progress meter needs callbacks."""
@@ -261,8 +337,8 @@ class _Solve(eqx.Module):
             return "forward"
         return "reverse" if isinstance(self.adjoint, diffrax.RecursiveCheckpointAdjoint) else "any"
 
-    def _diffeqsolve(self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any) -> Any:
-        y, ode = self.formulation.encode(system, t0, y0, args, self.rank)
+    def _diffeqsolve(self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, rank: int | None) -> Any:
+        y, ode = self.formulation.encode(system, t0, y0, args, rank)
         decode = _Decode(self.formulation, self.solver)
         between = self.saveat.dense or any(sub.ts is not None for sub in _subs(self.saveat)) or self.event is not None
 
@@ -293,7 +369,7 @@ class _Solve(eqx.Module):
             interpolation = Interpolation(_uniform(self.solver, sol.interpolation), decode, ode)
         return sol.t0, sol.t1, sol.ts, sol.ys, interpolation, sol.stats, sol.result, sol.event_mask
 
-    def _solution(self, out: Any, system: Any, t0: Any, y0: Any, args: Any) -> DAESolution:
+    def _solution(self, out: Any, args: Any, rank: int | None, consistent: Any) -> DAESolution:
         *fields, result, event_mask = out
         code = RESULTS.promote(result)
         _, _, ts, ys, *_ = fields
@@ -303,11 +379,8 @@ class _Solve(eqx.Module):
         if ts is not None:
             finite = [all_finite(*pair) for pair in _saved(self.saveat, ts, ys)]
             code = failed(RESULTS.successful, RESULTS.not_finite, ~jnp.all(jnp.stack(finite))) if finite else code
-        if not self.checked:
-            ode = MechanicalODE.of(system, t0, y0, args, self.rank)
-            consistent = violation(ode, t0, ode.encode(y0)).consistent()
-            code = RESULTS.where(consistent, code, RESULTS.inconsistent_start)
-        return DAESolution(*fields, code, event_mask, args, self.rank)
+        code = RESULTS.where(consistent, code, RESULTS.inconsistent_start)
+        return DAESolution(*fields, code, event_mask, args, rank)
 
 
 def _saved(saveat: Any, ts: Any, ys: Any) -> list[tuple[Any, Any]]:
@@ -352,16 +425,14 @@ def _economical(solver: Any, between: bool) -> Any:
     return unrolled(solver)
 
 
-@eqx.filter_jit
-def _jitted(solve: _Solve, *inputs: Any) -> DAESolution:
-    return solve(*inputs)
+_OKAY = {int(code._value) for code in (RESULTS.successful, RESULTS.event_occurred)}
 
 
 def _raise_if_failed(sol: DAESolution) -> DAESolution:
-    okay = (sol.result == RESULTS.successful) | (sol.result == RESULTS.event_occurred)
-    if isinstance(okay, jax.core.Tracer):
+    if isinstance(sol.result._value, jax.core.Tracer):
+        okay = (sol.result == RESULTS.successful) | (sol.result == RESULTS.event_occurred)
         return sol.result.error_if(sol, ~okay)
-    if bool(okay):
+    if int(sol.result._value) in _OKAY:
         return sol
     reached = [np.asarray(t)[np.isfinite(t)] for t in jax.tree.leaves(sol.ts)]
     last = [t[-1] for t in reached if t.size]

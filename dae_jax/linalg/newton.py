@@ -55,19 +55,24 @@ def newton(
             delta = linear_solve(jax.jacfwd(residual)(x, params), residual(x, params))
             return x - delta, relative_change(delta, x)
 
-        return fixed_point(correct, start, max_steps)
+        return fixed_point(correct, correct(start), max_steps)
 
     # The start is handed over, not closed over: the derivative rule may run when the trace it is of has ended.
     return implicit_root(from_start, iterate, (params, lax.stop_gradient(x0)), linear_solve=linear_solve)
 
 
 def fixed_point(
-    correct: Callable[[Any], tuple[Any, Float[Array, ""]]], x0: Any, max_steps: int = MAX_STEPS
+    correct: Callable[[Any], tuple[Any, Float[Array, ""]]],
+    first: tuple[Any, Float[Array, ""]],
+    max_steps: int = MAX_STEPS,
 ) -> tuple[Any, Bool[Array, ""]]:
-    """Applies `correct`: x ↦ (x, relative size of the correction) until what remains is round-off; see `newton`."""
-    _, size = jax.eval_shape(correct, x0)
-    tolerance = roundoff(size.dtype)
-    one = jnp.ones((), size.dtype)
+    """Applies `correct`: x ↦ (x, relative size of the correction) until what remains is round-off; see `newton`.
+
+    `first` is what the first correction gave.
+    """
+    x, last = first
+    tolerance = roundoff(last.dtype)
+    one = jnp.ones((), last.dtype)
 
     def unfinished(carry: Any) -> Bool[Array, ""]:
         _, last, previous, count = carry
@@ -82,8 +87,7 @@ def fixed_point(
         return x, size, jnp.maximum(last, jnp.finfo(last.dtype).tiny), count + 1
 
     # The correction before the first counts as 1, so that a first correction δ is expected to leave δ² behind.
-    x, size = correct(x0)
-    x, last, previous, _ = lax.while_loop(unfinished, body, (x, size, one, 1))
+    x, last, previous, _ = lax.while_loop(unfinished, body, (x, last, one, 1))
     remaining = last * jnp.minimum(last / previous, 1)
     return x, (remaining <= tolerance) | (last < 1000 * tolerance)
 

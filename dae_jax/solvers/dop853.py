@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from . import dop853_coefficients as coefficients
-from .explicit import combine, first_derivative, identity, increments
+from .explicit import Flat, combine, first_derivative, identity, increments
 
 
 STAGES = 12
@@ -69,44 +69,32 @@ class DOP853(diffrax.AbstractAdaptiveSolver):
         self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, state: Any, made_jump: Any, land: Callable[..., Any]
     ) -> Any:
         """`step`, with its end moved to `land(t1, y1)` → (y1, found)."""
-        control = terms.contr(t0, t1)
+        h = terms.contr(t0, t1)
+        flat = Flat(terms, y0, args, land)
+        increment = lambda t, y: h * flat.field(t, y)
+        k0 = h * first_derivative(flat, t0, state, made_jump)
+        ks = increments(_ROWS[: STAGES - 1], coefficients.C[1:STAGES], increment, t0, t1, flat.y0, k0)
+        y1, found = flat.land(t1, combine(coefficients.B, ks, flat.y0))
+        f1 = flat.field(t1, y1)
+        ks.append(h * f1)
+        error = _error(combine(coefficients.E5, ks), combine(coefficients.E3, ks), flat.y0, y1)
+        rest = self._interpolant(increment, t0, t1, flat.y0, y1, ks) if self.dense else [y1 - flat.y0]
+        dense = {"y0": y0, "f": jax.tree.map(lambda *f: jnp.stack(f), *map(flat.tree, rest))}
+        return flat.tree(y1), flat.tree(error), dense, flat.tree(f1), found
 
-        def vector(t: Any, y: Any) -> Any:
-            return jax.tree.map(lambda x: control * x, terms.vf(t, y, args))
-
-        f0 = first_derivative(lambda t, y: terms.vf(t, y, args), t0, y0, state, made_jump)
-        k0 = jax.tree.map(lambda x: control * x, f0)
-        ks = increments(_ROWS[: STAGES - 1], coefficients.C[1:STAGES], vector, t0, t1, y0, k0)
-        y1, found = land(t1, combine(coefficients.B, ks, y0))
-        f1 = terms.vf(t1, y1, args)
-        ks.append(jax.tree.map(lambda x: control * x, f1))
-        error = _error(combine(coefficients.E5, ks), combine(coefficients.E3, ks), y0, y1)
-        dense = {"y0": y0, "f": self._interpolant(vector, t0, t1, y0, y1, ks) if self.dense else _linear(y0, y1)}
-        return y1, error, dense, f1, found
-
-    def _interpolant(self, vector: Callable[..., Any], t0: Any, t1: Any, y0: Any, y1: Any, ks: list[Any]) -> Any:
+    def _interpolant(self, increment: Any, t0: Any, t1: Any, y0: Any, y1: Any, ks: list[Any]) -> list[Any]:
+        """The coefficients of the nested form."""
         for row, c in zip(_ROWS[STAGES:], coefficients.C[STAGES + 1 :], strict=True):
-            ks = [*ks, vector(t0 + float(c) * (t1 - t0), combine(row, ks, y0))]
-
-        def nested(y0: Any, y1: Any, k0: Any, k1: Any, *rest: Any) -> Any:
-            return jnp.stack([y1 - y0, k0 - (y1 - y0), 2 * (y1 - y0) - (k0 + k1), *rest])
-
-        rest = [combine(row, ks) for row in coefficients.D]
-        return jax.tree.map(nested, y0, y1, ks[0], ks[STAGES], *rest)
-
-
-def _linear(y0: Any, y1: Any) -> Any:
-    return jax.tree.map(lambda a, b: (b - a)[None], y0, y1)
+            ks = [*ks, increment(t0 + float(c) * (t1 - t0), combine(row, ks, y0))]
+        first, last = ks[0], ks[STAGES]
+        slopes = [y1 - y0, first - (y1 - y0), 2 * (y1 - y0) - (first + last)]
+        return slopes + [combine(row, ks) for row in coefficients.D]
 
 
 def _error(e5: Any, e3: Any, y0: Any, y1: Any) -> Any:
-    def squares(e: Any) -> Any:
-        # Relative to 1 + |y|, the scale of equal relative and absolute tolerances; only the ratio of the two counts.
-        scaled = jax.tree.map(lambda e, a, b: jnp.sum((e / (1 + jnp.maximum(jnp.abs(a), jnp.abs(b)))) ** 2), e, y0, y1)
-        return sum(jax.tree.leaves(scaled))
-
-    five, three = squares(e5), squares(e3)
+    # Relative to 1 + |y|, the scale of equal relative and absolute tolerances; only the ratio of the two counts.
+    weights = 1 / (1 + jnp.maximum(jnp.abs(y0), jnp.abs(y1))) ** 2
+    five, three = jnp.sum(weights * e5**2), jnp.sum(weights * e3**2)
     ratio = five / (five + 0.01 * three + float(jnp.finfo(five.dtype).tiny))
     # The derivative of the square root at 0 is infinite; an error of 0 needs none.
-    weight = jnp.sqrt(jnp.where(ratio > 0, ratio, 1)) * (ratio > 0)
-    return jax.tree.map(lambda e: weight * e, e5)
+    return e5 * jnp.sqrt(jnp.where(ratio > 0, ratio, 1)) * (ratio > 0)

@@ -7,6 +7,9 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from ..kernels import scalarise, subroutine
 
 
 def identity(_: Any, y: Any) -> tuple[Any, bool]:
@@ -16,14 +19,8 @@ def identity(_: Any, y: Any) -> tuple[Any, bool]:
 
 def combine(coefficients: Sequence[float] | np.ndarray, stages: Sequence[Any], y: Any = None) -> Any:
     """y + Σ cᵢ kᵢ over the coefficients that are not zero."""
-    pairs = [(float(c), k) for c, k in zip(coefficients, stages, strict=False) if c != 0]
-    trees = [k for _, k in pairs] + ([] if y is None else [y])
-
-    def add(*leaves: Any) -> Any:
-        total = sum(c * leaf for (c, _), leaf in zip(pairs, leaves, strict=False))
-        return total if y is None else leaves[-1] + total
-
-    return jax.tree.map(add, *trees)
+    total = sum(float(c) * k for c, k in zip(coefficients, stages, strict=False) if c != 0)
+    return total if y is None else y + total
 
 
 def increments(
@@ -35,6 +32,25 @@ def increments(
         ti = t1 if ci == 1 else t0 + float(ci) * (t1 - t0)
         ks.append(vector(ti, combine(row, ks, y0)))
     return ks
+
+
+class Flat:
+    """The field, the state and `land` of a step on one vector, in which every linear combination is one loop."""
+
+    def __init__(self, terms: Any, y0: Any, args: Any, land: Callable[..., Any]) -> None:
+        self.y0, self.tree = ravel_pytree(y0)
+        self.field = subroutine(scalarise(lambda t, y: self.vector(terms.vf(t, self.tree(y), args))))
+        self._land = land
+
+    @staticmethod
+    def vector(tree: Any) -> Any:
+        """The numbers of a pytree."""
+        return ravel_pytree(tree)[0]
+
+    def land(self, t: Any, y: Any) -> tuple[Any, Any]:
+        """Where a point lands, and whether it was found."""
+        end, found = self._land(t, self.tree(y))
+        return self.vector(end), found
 
 
 class Unrolled(diffrax.AbstractWrappedSolver):
@@ -80,32 +96,33 @@ class Unrolled(diffrax.AbstractWrappedSolver):
     ) -> Any:
         """`step`, with its end moved to `land(t1, y1)` → (y1, found)."""
         tableau = self.solver.tableau
-        control = terms.contr(t0, t1)
-        field = lambda t, y: terms.vf(t, y, args)
-        scaled = lambda f: jax.tree.map(lambda x: control * x, f)
-        f0 = first_derivative(field, t0, y0, state, made_jump)
+        h = terms.contr(t0, t1)
+        flat = Flat(terms, y0, args, land)
+        increment = lambda t, y: h * flat.field(t, y)
+        k0 = h * first_derivative(flat, t0, state, made_jump)
         rows, nodes = tableau.a_lower, tableau.c
         f1 = None
         if tableau.fsal:
-            ks = increments(rows[:-1], nodes[:-1], lambda t, y: scaled(field(t, y)), t0, t1, y0, scaled(f0))
-            y1, found = land(t1, combine(rows[-1], ks, y0))
-            f1 = field(t1, y1)
-            ks.append(scaled(f1))
+            ks = increments(rows[:-1], nodes[:-1], increment, t0, t1, flat.y0, k0)
+            y1, found = flat.land(t1, combine(rows[-1], ks, flat.y0))
+            f1 = flat.field(t1, y1)
+            ks.append(h * f1)
         else:
-            ks = increments(rows, nodes, lambda t, y: scaled(field(t, y)), t0, t1, y0, scaled(f0))
-            y1, found = land(t1, combine(tableau.b_sol, ks, y0))
-        error = combine(tableau.b_error, ks) if np.any(tableau.b_error) else None
-        dense = {"y0": y0, "y1": y1, "k": jax.tree.map(lambda *k: jnp.stack(k), *ks)}
-        return y1, error, dense, f1, found
+            ks = increments(rows, nodes, increment, t0, t1, flat.y0, k0)
+            y1, found = flat.land(t1, combine(tableau.b_sol, ks, flat.y0))
+        error = flat.tree(combine(tableau.b_error, ks)) if np.any(tableau.b_error) else None
+        dense = {"y0": y0, "y1": flat.tree(y1), "k": jax.tree.map(lambda *k: jnp.stack(k), *map(flat.tree, ks))}
+        return flat.tree(y1), error, dense, None if f1 is None else flat.tree(f1), found
 
 
-def first_derivative(field: Callable[..., Any], t0: Any, y0: Any, state: Any, made_jump: Any) -> Any:
+def first_derivative(flat: Flat, t0: Any, state: Any, made_jump: Any) -> Any:
     """f(t₀, y₀), from the last step where that left it."""
     if state is None or made_jump is True:
-        return field(t0, y0)
+        return flat.field(t0, flat.y0)
+    state = flat.vector(state)
     if made_jump is False:
         return state
-    return jax.lax.cond(made_jump, lambda: field(t0, y0), lambda: state)
+    return jax.lax.cond(made_jump, lambda: flat.field(t0, flat.y0), lambda: state)
 
 
 def unrolled(solver: diffrax.AbstractSolver) -> diffrax.AbstractSolver:

@@ -68,7 +68,7 @@ class OrthogonalProjection(diffrax.AbstractWrappedSolver, AbstractManifoldSolver
         sign = clock(terms, t0, t1)
 
         def land(t: Any, y: Any) -> Any:
-            return args.restore(sign * t, y, args.normals(sign * t, y))
+            return args.project(sign * t, y)
 
         if hasattr(solver, "landing_step"):
             y1, error, dense, state, found = solver.landing_step(terms, t0, t1, y0, args, solver_state, made_jump, land)
@@ -81,5 +81,5 @@ class OrthogonalProjection(diffrax.AbstractWrappedSolver, AbstractManifoldSolver
         return or_nan(found, y1), error, dense, state, result
 
     def land(self, t: Any, y: Any, ode: Any) -> Any:
-        y, found = ode.restore(t, y, ode.normals(t, y))
+        y, found = ode.project(t, y)
         return or_nan(found, y)

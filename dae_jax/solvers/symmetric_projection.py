@@ -73,5 +73,5 @@ class SymmetricProjection(AbstractManifoldSolver):
         return y1, None, hermite(terms, args, t0, t1, y0, y1), None, outcome(found)
 
     def land(self, t: Any, y: Any, ode: Any) -> Any:
-        y, found = ode.restore(t, y, ode.normals(t, y))
+        y, found = ode.project(t, y)
         return or_nan(found, y)
