@@ -59,9 +59,9 @@ def measure_together(solves, repeats=7, min_time=0.1, firsts=None):
     }
 
 
-def save(name, rows, packages=()):
-    """Write `rows` (dicts; a Timing in them becomes a dict) to results/<name>.json with machine, versions and date."""
-    RESULTS.mkdir(exist_ok=True)
+def save(name, rows, folder, packages=()):
+    """Write `rows` (dicts; a Timing in them becomes a dict) to <folder>/<name>.json with machine, versions and date."""
+    folder.mkdir(parents=True, exist_ok=True)
     record = {
         "name": name,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -69,7 +69,7 @@ def save(name, rows, packages=()):
         "versions": versions(packages),
         "rows": [{k: asdict(v) if isinstance(v, Timing) else v for k, v in row.items()} for row in rows],
     }
-    path = RESULTS / f"{name}.json"
+    path = folder / f"{name}.json"
     path.write_text(json.dumps(record, indent=1) + "\n")
     return path
 

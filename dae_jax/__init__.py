@@ -1,6 +1,7 @@
 """Differentiable solvers for differential-algebraic equations in JAX."""
 
 from .diagnostics import Drift as Drift, drift as drift, energy as energy, multipliers as multipliers
+from .explain import Plan as Plan, explain as explain
 from .formulations import (
     AbstractFormulation as AbstractFormulation,
     Baumgarte as Baumgarte,

@@ -1,6 +1,7 @@
 """The command line: `dae-jax`, also `python -m dae_jax`."""
 
 import argparse
+import importlib
 import importlib.metadata
 import sys
 from pathlib import Path
@@ -15,7 +16,14 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--version", action="version", version=importlib.metadata.version("dae_jax"))
     commands = parser.add_subparsers(dest="command", required=True)
     _add_compare(commands)
-    arguments = parser.parse_args(argv)
+    commands.add_parser(
+        "bench", help="run the benchmarks of a source checkout; `bench --help` lists them", add_help=False
+    )
+    arguments, rest = parser.parse_known_args(argv)
+    if arguments.command == "bench":
+        return _bench(parser, rest)
+    if rest:
+        parser.error(f"unrecognized arguments: {' '.join(rest)}")
     return arguments.run(parser, arguments)
 
 
@@ -54,6 +62,16 @@ def _compare(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> 
     for path in write(scene, rows, solutions, arguments.rtol, folder):
         print(path)
     return 0
+
+
+def _bench(parser: argparse.ArgumentParser, arguments: list[str]) -> int:
+    root = Path(__file__).parent.parent
+    if not (root / "benchmarks" / "__main__.py").exists():
+        parser.error(
+            "the benchmarks are part of the source repository, not of the installed package; run it from a checkout"
+        )
+    sys.path.insert(0, str(root))
+    return importlib.import_module("benchmarks.__main__").main(arguments)
 
 
 if __name__ == "__main__":

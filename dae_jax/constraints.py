@@ -5,6 +5,7 @@ and their hidden derivatives. Formulations and solvers see a system through this
 """
 
 import abc
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -16,13 +17,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .kernels import scalarise, subroutine
-from .linalg import fixed_point, implicit_root, relative_change, semidefinite_solve, solve
+from .linalg import fixed_point, implicit_root, relative_change, solve
+from .normals import SPARSE_FROM, DenseNormals, SparseNormals, constraint_pattern, mass_solve, matvec, sparse_normals
 from .structure.layout import Layout
 from .systems import ConstrainedSystem
-
-
-# Up to this many multiplications a product is written as a sum, which can become part of a kernel; a dot cannot.
-SUMMED = 4096
 
 
 def at_one_instant(method: Callable[..., Any]) -> Callable[..., Any]:
@@ -99,7 +97,7 @@ class MechanicalODE(ManifoldODE):
     holonomic: int = eqx.field(static=True)
     nonholonomic: int = eqx.field(static=True)
     depends_on_time: tuple[bool, bool] = eqx.field(static=True)
-    rank: int | None = eqx.field(static=True)
+    linear: DenseNormals | SparseNormals = eqx.field(static=True)
 
     @classmethod
     def of(cls, system: ConstrainedSystem, t: Any, state: Any, args: Any, rank: int | None = None) -> "MechanicalODE":
@@ -110,7 +108,20 @@ class MechanicalODE(ManifoldODE):
         g, g_uses_time = _outline(system.constraint, t, q, args)
         h, h_uses_time = _outline(system.nonholonomic, t, q, v, args)
         rank = system.rank if rank is None else rank
-        return cls(system, args, layout, g, h, (g_uses_time, h_uses_time), rank if rank != g + h else None)
+        rank = None if rank == g + h else rank
+        ode = cls(system, args, layout, g, h, (g_uses_time, h_uses_time), DenseNormals(g, h, rank))
+        sparse = ode._sparse(t, layout.flatten(q)) if h == 0 and g >= SPARSE_FROM and rank is None else None
+        return ode if sparse is None else dataclasses.replace(ode, linear=sparse)
+
+    def _sparse(self, t: Any, q: Any) -> SparseNormals | None:
+        mass = jax.eval_shape(self.mass, q)
+        pattern = constraint_pattern(self.constraint, t, q) if mass is None or mass.ndim < 2 else None
+        return None if pattern is None else sparse_normals(pattern)
+
+    @property
+    def rank(self) -> int | None:
+        """How many constraints are independent, where some are redundant."""
+        return self.linear.rank if isinstance(self.linear, DenseNormals) else None
 
     def decode(self, t: Any, y: Any) -> Any:
         q, v = y
@@ -186,14 +197,13 @@ class MechanicalODE(ManifoldODE):
         return self._accelerations(t, *y, None)[1]
 
     def _accelerations(self, t: Any, q: Any, v: Any, feedback: Any) -> tuple[Float[Array, " n"], Float[Array, " mp"]]:
-        a, m = self.constraint_jacobian(t, q, v), self.mass(q)
-        normals = mass_solve(m, a.T)
-        free = mass_solve(m, self.force(t, q, v))
+        normals = self.normals(t, (q, v))
+        free = mass_solve(self.mass(q), self.force(t, q, v))
         target = self.bias(t, q, v)
         if feedback is not None:
             target = target + self._feedback(t, q, v, feedback)
-        multipliers = semidefinite_solve(_matmul(a, normals), _matvec(a, free) + target, self.rank)
-        return free - _matvec(normals, multipliers), multipliers
+        multipliers = self.linear.gram_solve(self, normals, self.linear.along(self, normals, free) + target)
+        return free - self.linear.lift(self, normals, multipliers), multipliers
 
     def _feedback(self, t: Any, q: Any, v: Any, feedback: Any) -> Float[Array, " mp"]:
         velocity = self.velocity_constraint(t, q, v)
@@ -212,37 +222,23 @@ class MechanicalODE(ManifoldODE):
         return self.constraint(t, q), self.velocity_constraint(t, q, v)
 
     @at_one_instant
-    def normals(self, t: Any, y: Any) -> tuple[Float[Array, "mp n"], Float[Array, "n mp"]]:
-        """A and M⁻¹Aᵀ: the normals in the metric of the mass matrix."""
-        q, v = y
-        a = self.constraint_jacobian(t, q, v)
-        return a, mass_solve(self.mass(q), a.T)
+    def normals(self, t: Any, y: Any) -> Any:
+        """The constraints' linearisation, as `normals.DenseNormals` and `normals.SparseNormals` have it."""
+        return self.linear.at(self, t, *y)
 
     @at_one_instant
     def tangent(self, dy: Any, normals: Any) -> Any:
-        a, n = normals
-        m = self.holonomic
         dq, dv = dy
-        return self._tangent(a[:m], n[:, :m], dq), self._tangent(a, n, dv)
+        return self._tangent(normals, dq, self.holonomic), self._tangent(normals, dv, None)
 
-    def _tangent(self, a: Float[Array, "c n"], n: Float[Array, "n c"], x: Float[Array, " n"]) -> Float[Array, " n"]:
-        if a.shape[0] == 0:
-            return x
-        return x - _matvec(n, semidefinite_solve(_matmul(a, n), _matvec(a, x), self._rank_of(a.shape[0])))
-
-    def _rank_of(self, rows: int) -> int | None:
-        """The rank of the first `rows` constraints: `rank` counts the holonomic and the nonholonomic ones together, and
-        the redundant ones are taken to be holonomic where there are any.
-        """
-        if self.rank is None or rows == self.holonomic + self.nonholonomic:
-            return self.rank
-        return max(self.rank - self.nonholonomic, 0)
+    def _tangent(self, normals: Any, x: Float[Array, " n"], rows: int | None) -> Float[Array, " n"]:
+        off = self.linear.along(self, normals, x)[:rows]
+        return x - self.linear.lift(self, normals, self.linear.gram_solve(self, normals, off)) if off.size else x
 
     def shift(self, y: Any, normals: Any, mu: Float[Array, " c"]) -> Any:
-        _, n = normals
         q, v = y
         m = self.holonomic
-        return q + _matvec(n[:, :m], mu[:m]), v + _matvec(n, mu[m:])
+        return q + self.linear.lift(self, normals, mu[:m]), v + self.linear.lift(self, normals, mu[m:])
 
     def restore(self, t: Any, y: Any, normals: Any) -> tuple[Any, Bool[Array, ""]]:
         q, _ = y
@@ -276,17 +272,15 @@ class MechanicalODE(ManifoldODE):
         The matrix is A M⁻¹Aᵀ at the current point, which differs from the Jacobian A N by the square of the angle
         between the two normal spaces and stays symmetric.
         """
-        m = self.holonomic
         q, v = self.shift(y, normals, mu)
-        a, n = self.normals(t, (q, v))
-        s = _matmul(a, n)
-        delta = jnp.zeros(0, q.dtype)
-        if m:
-            delta = semidefinite_solve(s[:m, :m], self.constraint(t, q), self._rank_of(m))
-            q = q - _matvec(normals[1][:, :m], delta)
-        dv = semidefinite_solve(s, self.velocity_constraint(t, q, v), self.rank)
-        sizes = [relative_change(_matvec(normals[1][:, :m], delta), q), relative_change(_matvec(normals[1], dv), v)]
-        return mu - jnp.concatenate([delta, dv]), jnp.maximum(*sizes)
+        here = self.normals(t, (q, v))
+        dq, delta = jnp.zeros_like(q), jnp.zeros(0, q.dtype)
+        if self.holonomic:
+            delta = self.linear.gram_solve(self, here, self.constraint(t, q))
+            dq = self.linear.lift(self, normals, delta)
+        kappa = self.linear.gram_solve(self, here, self.velocity_constraint(t, q - dq, v))
+        sizes = relative_change(dq, q), relative_change(self.linear.lift(self, normals, kappa), v)
+        return mu - jnp.concatenate([delta, kappa]), jnp.maximum(*sizes)
 
 
 def _manifold_residual(mu: Float[Array, " c"], params: Any) -> Float[Array, " c"]:
@@ -296,26 +290,7 @@ def _manifold_residual(mu: Float[Array, " c"], params: Any) -> Float[Array, " c"
 
 def _minimum_norm(a: Float[Array, "c c"], b: Float[Array, " c"]) -> Float[Array, " c"]:
     # The relative cut-off separates redundancy from conditioning: on the manifold the dependent rows agree to round-off.
-    return _matvec(jnp.linalg.pinv(a, rtol=float(jnp.finfo(a.dtype).eps) ** 0.5), b)
-
-
-def mass_solve(mass: Float[Array, "..."] | None, x: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
-    """M⁻¹ x for M as `ConstrainedSystem.mass_matrix` gives it."""
-    if mass is None:
-        return x
-    if mass.ndim < 2:
-        return x / (mass[:, None] if mass.ndim and x.ndim == 2 else mass)
-    return semidefinite_solve(mass, x)
-
-
-def _matmul(a: Float[Array, "i j"], b: Float[Array, "j k"]) -> Float[Array, "i k"]:
-    if a.size * b.shape[1] > SUMMED:
-        return jnp.dot(a, b, precision=jax.lax.Precision.HIGHEST)
-    return jnp.sum(a[:, :, None] * b[None, :, :], 1)
-
-
-def _matvec(a: Float[Array, "i j"], x: Float[Array, " j"]) -> Float[Array, " i"]:
-    return jnp.sum(a * x, 1)
+    return matvec(jnp.linalg.pinv(a, rtol=float(jnp.finfo(a.dtype).eps) ** 0.5), b)
 
 
 def _outline(function: Callable[..., Any] | None, *args: Any) -> tuple[int, bool]:

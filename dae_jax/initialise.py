@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .constraints import MechanicalODE, mass_solve
+from .constraints import MechanicalODE
 from .linalg import fixed_point, implicit_root, relative_change
+from .normals import mass_solve
 from .systems import ConstrainedSystem
 
 
@@ -18,15 +19,12 @@ class Violation(eqx.Module):
 
     `residuals`: g and (ġ, h); `distances`: the same divided by the length of each constraint's gradient, that is about
     how far the state is from satisfying it; `allowed`: the distance that counts as round-off of the user's numbers, for
-    each level; `rank`: how many constraints are independent; `contradiction`: the part of the accelerations' right-hand
-    side that no multipliers can satisfy, relative to its size.
+    each level.
     """
 
     residuals: tuple[Float[Array, " m"], Float[Array, " mp"]]
     distances: tuple[Float[Array, " m"], Float[Array, " mp"]]
     allowed: tuple[Float[Array, ""], Float[Array, ""]]
-    rank: Any
-    contradiction: Float[Array, ""]
 
     def consistent(self) -> Bool[Array, ""]:
         """Whether every level is within `allowed`; false for NaN."""
@@ -49,23 +47,39 @@ def violation(ode: MechanicalODE, t: Any, y: Any) -> Violation:
     """How far the flat state y = (q, v) is from the manifold."""
     q, v = y
     residuals = ode.invariants(t, y)
-    a, normals = ode.normals(t, y)
-    lengths = jnp.sqrt(jnp.sum(a * a, 1))
+    lengths = ode.linear.lengths(ode.normals(t, y))
     lengths = jnp.where(lengths > 0, lengths, 1)
     distances = tuple(
         jnp.abs(r) / length for r, length in zip(residuals, (lengths[: ode.holonomic], lengths), strict=True)
     )
     root = jnp.finfo(q.dtype).eps ** 0.5
     allowed = tuple(root * (1 + jnp.max(jnp.abs(x))) for x in (q, v))
-    schur = jnp.dot(a, normals)
-    scale = 1 / lengths
+    return Violation(residuals, distances, allowed)
+
+
+class Redundancy(eqx.Module):
+    """`rank`: how many constraints are independent; `contradiction`: the part of the accelerations' right-hand side that
+    no multipliers can satisfy, relative to its size.
+    """
+
+    rank: Any
+    contradiction: Float[Array, ""]
+
+
+def redundancy(ode: MechanicalODE, t: Any, y: Any) -> Redundancy:
+    """Whether constraints depend on each other at the flat state y = (q, v)."""
+    q, v = y
+    a = ode.constraint_jacobian(t, q, v)
+    mass = ode.mass(q)
+    lengths = jnp.sqrt(jnp.sum(a * a, 1))
+    scale = 1 / jnp.where(lengths > 0, lengths, 1)
+    schur = jnp.dot(a, mass_solve(mass, a.T))
     eigenvalues, vectors = jnp.linalg.eigh(schur * scale[:, None] * scale[None, :])
-    independent = eigenvalues > root * jnp.max(eigenvalues)
-    free = mass_solve(ode.mass(q), ode.force(t, q, v))
-    target = (jnp.dot(a, free) + ode.bias(t, q, v)) * scale
+    independent = eigenvalues > jnp.finfo(q.dtype).eps ** 0.5 * jnp.max(eigenvalues)
+    target = (jnp.dot(a, mass_solve(mass, ode.force(t, q, v))) + ode.bias(t, q, v)) * scale
     dependent = jnp.where(independent, 0, jnp.dot(vectors.T, target))
     contradiction = jnp.max(jnp.abs(dependent)) / (1 + jnp.max(jnp.abs(target)))
-    return Violation(residuals, distances, allowed, jnp.sum(independent), contradiction)
+    return Redundancy(jnp.sum(independent), contradiction)
 
 
 def consistent_state(system: ConstrainedSystem, t0: Any, y0: Any, args: Any = None, *, fixed: Any = None) -> Any:
@@ -122,7 +136,7 @@ def _improved(x: Float[Array, " 2n"], params: Any) -> Float[Array, " 2n"]:
     ode, t, (q0, v0), (wq, wv) = params
     q, v = jnp.split(x, 2)
     m = ode.holonomic
-    a = ode.normals(t, (q, v))[0]
+    a = ode.constraint_jacobian(t, q, v)
     metric = lambda w, rows: w[:, None] * mass_solve(ode.mass(q0), (rows * w).T)
     g, _ = ode.invariants(t, (q, v))
     if m:

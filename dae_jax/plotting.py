@@ -137,3 +137,13 @@ def work_precision(points: Mapping[str, tuple[Sequence[float], Sequence[float]]]
     axes.set(xlabel="run time in s", ylabel="largest error against the reference", title=title)
     _legend_beside(figure)
     return figure
+
+
+def scaling(curves: Curves, size: str, quantity: str, title: str = "") -> Any:
+    """A cost over the size of a problem on log axes; `curves` maps a label to (sizes, costs)."""
+    figure, axes = _figure()
+    for i, (label, (x, y)) in enumerate(curves.items()):
+        axes.loglog(x, y, label=label, **_look(i))
+    axes.set(xlabel=size, ylabel=quantity, title=title)
+    _legend_beside(figure)
+    return figure

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .constraints import MechanicalODE, at_one_instant
+from .normals import mass_solve
 from .structure.layout import Layout
 from .systems import ConstrainedSystem, ImplicitDAE, SemiExplicitDAE, System
 
@@ -115,10 +116,8 @@ class ResidualForm(eqx.Module):
             return jnp.concatenate([kinematics, momentum, ode.constraint(t, q), velocity[m:]])
         if self.form == "index-2":
             return jnp.concatenate([kinematics, momentum, velocity])
-        normals = ode.normals(t, (q, v))[1]
-        return jnp.concatenate(
-            [kinematics + normals[:, :m] @ y[2 * n + m + p :], momentum, velocity, ode.constraint(t, q)]
-        )
+        normals = mass_solve(mass, a[:m].T)
+        return jnp.concatenate([kinematics + normals @ y[2 * n + m + p :], momentum, velocity, ode.constraint(t, q)])
 
 
 def _names(stem: str, out: Any) -> tuple[str, ...]:

@@ -12,9 +12,9 @@ import pytest
 PACKAGE = Path(__file__).parent.parent / "dae_jax"
 LAYERS = (
     {"kernels", "linalg", "structure"},
-    {"constraints", "initialise", "residual", "systems"},
+    {"constraints", "initialise", "normals", "residual", "systems"},
     {"formulations", "solvers"},
-    {"diagnostics", "solution", "solve"},
+    {"checks", "diagnostics", "explain", "program", "solution", "solve"},
     {"compare", "plotting", "scenes", "sweep", "tune"},
     {"__main__", "cli"},
 )

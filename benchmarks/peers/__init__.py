@@ -16,6 +16,7 @@ import importlib
 
 
 NAMES = (
+    "dae_jax_peer",
     "c_limit",
     "heyoka_peer",
     "plain_diffrax",

@@ -1,5 +1,12 @@
 """How small functions become fast machine code: scalar arithmetic and single kernels."""
 
-from .one_kernel import configure as configure, hindrances as hindrances, one_kernel as one_kernel
+from .one_kernel import (
+    configure as configure,
+    equations as equations,
+    hindrances as hindrances,
+    one_kernel as one_kernel,
+    one_kernel_enabled as one_kernel_enabled,
+    without_checks as without_checks,
+)
 from .scalarise import scalarise as scalarise
 from .subroutine import subroutine as subroutine

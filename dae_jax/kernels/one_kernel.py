@@ -8,11 +8,13 @@ that it contains must then be plain arithmetic, so the jaxpr is looked at first.
 import contextlib
 import contextvars
 import math
+import os
 from collections.abc import Callable, Iterator
 from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+from jax._src import xla_bridge
 from jax.custom_batching import custom_vmap
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
@@ -28,19 +30,42 @@ SMALL_DOT = 64
 _enabled: contextvars.ContextVar[bool] = contextvars.ContextVar("one_kernel", default=True)
 
 
-@contextlib.contextmanager
-def configure(*, one_kernel: bool) -> Iterator[None]:
-    """Switches one-kernel compilation on or off for solves that are traced inside the `with` block."""
-    token = _enabled.set(one_kernel)
-    try:
-        yield
-    finally:
-        _enabled.reset(token)
+def configure(*, one_kernel: bool | None = None, process_wide: bool = False) -> contextlib.ExitStack:
+    """Settings of the compilation.
+
+    - `one_kernel`: switches one-kernel compilation on or off, at once; used in a `with` statement, until its end.
+    - `process_wide`: for programs that solve many small problems. Every small loop of the process is compiled to one
+      kernel, also those of other libraries, and a computation runs in the thread that calls it, which saves the 10 to
+      50 µs of handing it to another. Call it before JAX computes anything.
+
+    Errors: `RuntimeError` where JAX has computed something before a process-wide setting.
+    """
+    restore = contextlib.ExitStack()
+    if one_kernel is not None:
+        restore.callback(_enabled.reset, _enabled.set(one_kernel))
+    if process_wide:
+        _configure_process()
+    return restore
+
+
+def _configure_process() -> None:
+    if xla_bridge.backends_are_initialized():
+        raise RuntimeError(
+            "`configure(process_wide=True)` comes too late: JAX has started already. Call it right after the imports."
+        )
+    options = "xla_cpu_small_while_loop_byte_threshold=65536,xla_cpu_use_multi_output_fusion"
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_extra_options={options}"
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
+
+
+def one_kernel_enabled() -> bool:
+    """Whether solves that are traced now may become one kernel."""
+    return _enabled.get()
 
 
 def hindrances(jaxpr: ClosedJaxpr | Jaxpr) -> tuple[str, ...]:
     """The names of the primitives in `jaxpr`, at any depth, that keep it from being one kernel; empty if none does."""
-    return tuple(dict.fromkeys(eqn.primitive.name for eqn in _equations(jaxpr) if _hinders(eqn)))
+    return tuple(dict.fromkeys(eqn.primitive.name for eqn in equations(jaxpr) if _hinders(eqn)))
 
 
 def _hinders(eqn: Any) -> bool:
@@ -56,7 +81,8 @@ def _hinders(eqn: Any) -> bool:
     return name in _REFUSED
 
 
-def _equations(jaxpr: ClosedJaxpr | Jaxpr) -> Iterator[Any]:
+def equations(jaxpr: ClosedJaxpr | Jaxpr) -> Iterator[Any]:
+    """The equations of a jaxpr, at any depth."""
     for eqn in (jaxpr.jaxpr if isinstance(jaxpr, ClosedJaxpr) else jaxpr).eqns:
         yield eqn
         yield from _equations_in(eqn)
@@ -65,7 +91,7 @@ def _equations(jaxpr: ClosedJaxpr | Jaxpr) -> Iterator[Any]:
 def _equations_in(eqn: Any) -> Iterator[Any]:
     for param in jax.tree.leaves(tuple(eqn.params.values()), is_leaf=_is_jaxpr):
         if _is_jaxpr(param):
-            yield from _equations(param)
+            yield from equations(param)
 
 
 def _is_jaxpr(x: Any) -> bool:
@@ -107,7 +133,7 @@ def _unchecked(eqn: Any) -> ClosedJaxpr | None:
     if name not in ("jit", "pjit", "custom_jvp_call", "cond") or not any(map(_is_check, _equations_in(eqn))):
         return None
     if name == "cond":
-        return next((b for b in eqn.params["branches"] if not any(map(_is_check, _equations(b)))), None)
+        return next((b for b in eqn.params["branches"] if not any(map(_is_check, equations(b)))), None)
     return eqn.params["call_jaxpr" if name == "custom_jvp_call" else "jaxpr"]
 
 
@@ -208,7 +234,7 @@ def _compile(fn: Callable[..., Any], args: Any, batched: bool = False) -> Any:
     jaxpr = jax.make_jaxpr(without_checks(fn))(*args)
     call = jax.jit(jaxpr_as_fun(jaxpr))
     # Of the scatters only the update of one row becomes a copy, and that for certain only where nothing is batched.
-    if hindrances(jaxpr) or (batched and any(e.primitive.name.startswith("scatter") for e in _equations(jaxpr))):
+    if hindrances(jaxpr) or (batched and any(e.primitive.name.startswith("scatter") for e in equations(jaxpr))):
         return call(*args)
     with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
         return call(*args)

@@ -18,11 +18,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Literal
+from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 
 
 # Above this many scalar operations straight-line code costs more to compile than it saves at run time.
-LIMIT = 3000
+LIMIT = 500
 
 _ELEMENTWISE = frozenset(
     "abs acos acosh add and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type cos cosh digamma div eq "
@@ -30,8 +30,8 @@ _ELEMENTWISE = frozenset(
     "neg nextafter not or pow rem round rsqrt select_n sign sin sinh sqrt square sub tan tanh xor".split()
 )
 _STRUCTURAL = frozenset(
-    "add_any broadcast_in_dim concatenate copy copy_p dot_general dynamic_slice expand_dims gather iota pad reduce_sum "
-    "reshape rev slice split squeeze stack stop_gradient transpose".split()
+    "add_any broadcast_in_dim concatenate copy copy_p dot_general dynamic_slice expand_dims gather iota pad reduce_max "
+    "reduce_sum reshape rev slice split squeeze stack stop_gradient transpose".split()
 )
 # Operations on two known scalars that numpy does while tracing.
 _FOLDED = {
@@ -72,12 +72,18 @@ def scalarise(fn: Callable[..., Any], limit: int = LIMIT) -> Callable[..., Any]:
             return fn(*jax.tree.unflatten(treedef, flat_leaves))
 
         jaxpr, out = jax.make_jaxpr(flat, return_shape=True)(*leaves)
+        shapes, out_tree = jax.tree.flatten(out)
+
+        def as_scalars(*flat_leaves: Any) -> list[jax.Array]:
+            outputs = _Interpreter(limit).run(jaxpr, [_scalars(leaf) for leaf in flat_leaves])
+            return [_array(o, s) for o, s in zip(outputs, shapes, strict=True)]
+
         try:
-            outputs = _Interpreter(limit).run(jaxpr, [_scalars(leaf) for leaf in leaves])
+            # In a trace of its own, so that an attempt that is given up leaves nothing behind.
+            rewritten = jax.make_jaxpr(as_scalars)(*leaves)
         except _NotScalar:
             return fn(*args)
-        shapes, out_tree = jax.tree.flatten(out)
-        return jax.tree.unflatten(out_tree, [_array(o, s) for o, s in zip(outputs, shapes, strict=True)])
+        return jax.tree.unflatten(out_tree, jaxpr_as_fun(rewritten)(*leaves))
 
     return scalarised
 
@@ -114,7 +120,7 @@ def _known(x: Any) -> bool:
     return isinstance(x, np.generic)
 
 
-def _is(x: Any, value: int) -> bool:
+def _is(x: Any, value: float) -> bool:
     return isinstance(x, np.generic) and x == value
 
 
@@ -303,12 +309,30 @@ class _Interpreter:
         return x[tuple(slice(s, s + k) for s, k in zip(first, sizes, strict=True))]
 
     def reduce_sum(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
+        return self.reduced(eqn, args[0], self.total, 0)
+
+    def reduce_max(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
+        return self.reduced(eqn, args[0], self.larger, -np.inf)
+
+    def larger(self, a: Any, b: Any) -> Any:
+        if _known(a) and _known(b):
+            return np.maximum(a, b)
+        if _is(a, -np.inf):
+            return b
+        self.operations += 1
+        return jax.lax.max(*(jnp.asarray(x, (b if _known(a) else a).dtype) for x in (a, b)))
+
+    def reduced(self, eqn: Any, x: np.ndarray, combine: Callable[[Any, Any], Any], identity: float) -> np.ndarray:
+        dtype = eqn.outvars[0].aval.dtype
+        if identity and not jnp.issubdtype(dtype, jnp.floating):
+            raise _NotScalar
         axes = eqn.params["axes"]
-        x = np.moveaxis(args[0], axes, range(len(axes)))
+        x = np.moveaxis(x, axes, range(len(axes)))
         x = x.reshape((-1, *x.shape[len(axes) :]))
-        zero = np.zeros((), eqn.outvars[0].aval.dtype)[()]
-        sums = [functools.reduce(self.total, x[(slice(None), *i)], zero) for i in np.ndindex(x.shape[1:])]
-        return _object(sums, x.shape[1:])
+        first = np.asarray(identity, dtype)[()]
+        return _object(
+            [functools.reduce(combine, x[(slice(None), *i)], first) for i in np.ndindex(x.shape[1:])], x.shape[1:]
+        )
 
     def dot_general(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
         (lhs_contract, rhs_contract), (lhs_batch, rhs_batch) = eqn.params["dimension_numbers"]

@@ -1,6 +1,7 @@
 """Linear and nonlinear equations of a few unknowns, solved in plain arithmetic; LAPACK above a measured size."""
 
 from .dense import solve as solve
+from .elimination import Elimination as Elimination, elimination as elimination, take as take
 from .newton import (
     fixed_point as fixed_point,
     implicit_root as implicit_root,
@@ -8,4 +9,5 @@ from .newton import (
     relative_change as relative_change,
     roundoff as roundoff,
 )
+from .norm import rms_norm as rms_norm
 from .semidefinite import semidefinite_solve as semidefinite_solve

@@ -36,22 +36,20 @@ def semidefinite_solve(
     return _unrolled(s, b)
 
 
-def _threshold(s: Float[Array, "m m"]) -> float:
-    """The relative size below which a pivot of S is round-off."""
-    return 8 * s.shape[0] * float(jnp.finfo(s.dtype).eps)
+def definite_pivot(pivot: Float[Array, "*k"], diagonal: Float[Array, "*k"], m: int) -> Float[Array, "*k"]:
+    """The pivot of an m×m matrix, or NaN where it is round-off of the diagonal entry that it was."""
+    return jnp.where(pivot > 8 * m * float(jnp.finfo(pivot.dtype).eps) * diagonal, pivot, jnp.nan)
 
 
 def _unrolled(s: Float[Array, "m m"], b: Float[Array, "m *k"]) -> Float[Array, "m *k"]:
     m = s.shape[0]
-    threshold = _threshold(s)
     lower: list[list[Array]] = [[] for _ in range(m)]  # L D, row by row
     inverse: list[Array] = []  # 1 / D
     x: list[Array] = []
     for i in range(m):
         for j in range(i + 1):
             lower[i].append(s[i, j] - _sum(lower[i][k] * (lower[j][k] * inverse[k]) for k in range(j)))
-        pivot = lower[i][i]
-        inverse.append(1 / jnp.where(pivot > threshold * s[i, i], pivot, jnp.nan))
+        inverse.append(1 / definite_pivot(lower[i][i], s[i, i], m))
         x.append(b[i] - _sum(lower[i][k] * x[k] for k in range(i)))
         x[i] = x[i] * inverse[i]
     for i in reversed(range(m)):
@@ -67,7 +65,6 @@ def _sum(terms):
 def _looped(s: Float[Array, "m m"], b: Float[Array, "m *k"]) -> Float[Array, "m *k"]:
     """Gauss–Jordan elimination without pivoting, a column at a time, on [S | b]."""
     m = s.shape[0]
-    threshold = _threshold(s)
     diagonal = jnp.diagonal(s)
     rhs = b if b.ndim == 2 else b[:, None]
     rows = jnp.arange(m)
@@ -75,7 +72,7 @@ def _looped(s: Float[Array, "m m"], b: Float[Array, "m *k"]) -> Float[Array, "m 
     def eliminate(j, carry):
         s, rhs = carry
         pivot = s[j, j]
-        inverse = 1 / jnp.where(pivot > threshold * diagonal[j], pivot, jnp.nan)
+        inverse = 1 / definite_pivot(pivot, diagonal[j], m)
         row, right = s[j] * inverse, rhs[j] * inverse
         # Row j becomes the scaled pivot row; from every other row its multiple is taken.
         factor = jnp.where((rows == j)[:, None], pivot - 1, s[:, j][:, None])

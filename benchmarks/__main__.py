@@ -1,0 +1,63 @@
+"""Every measurement: `python -m benchmarks` or `dae-jax bench`."""
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+from . import chain, cost, sweep, timing, work_precision
+from .peers import NAMES, PACKAGES, load
+
+
+PARTS = {"work-precision": work_precision, "chain": chain, "cost": cost, "sweep": sweep}
+
+
+def main(argv=None):
+    """Print the tables, write data and figures, and set the measurements against what they must reach."""
+    parser = argparse.ArgumentParser(prog="dae-jax bench", description=__doc__)
+    parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=PARTS, metavar="PART", help=", ".join(PARTS))
+    parser.add_argument("--peers", nargs="+", default=NAMES, choices=NAMES, metavar="PEER", help=", ".join(NAMES))
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--quick", action="store_true", help="a smoke test: few points; this library, C and diffrax")
+    parser.add_argument("--out", type=Path, default=timing.RESULTS, help="folder for data and figures")
+    arguments = parser.parse_args(argv)
+    os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    names = [n for n in arguments.peers if not arguments.quick or n in ("dae_jax_peer", "c_limit", "plain_diffrax")]
+    peers = available(names)
+    verdicts = []
+    for part in arguments.parts:
+        print(f"\n== {part}: {PARTS[part].__doc__}")
+        rows = PARTS[part].run(peers, arguments.repeats, arguments.quick)
+        print("written:", timing.save(part, rows, arguments.out, PACKAGES))
+        for name, figure in PARTS[part].figures(rows):
+            figure.savefig(arguments.out / f"{name}.png")
+            print("written:", arguments.out / f"{name}.png")
+        verdicts += PARTS[part].targets(rows)
+    print("\n== what must be reached")
+    for text, measured, limit in verdicts:
+        print(verdict(text, measured, limit))
+    return 0
+
+
+def verdict(text, measured, limit):
+    """One line: what, measured, reached or not."""
+    if measured is None:
+        return f"{text:<56} not measured: nothing to compare with"
+    reached = measured >= limit if "≥" in text else measured <= limit
+    return f"{text:<56} {measured:10.3g}   {'reached' if reached else 'MISSED'}"
+
+
+def available(names):
+    """The peers that can run here, each with its formulation; the others are named, with the reason."""
+    peers = []
+    for name in names:
+        peer = load(name)
+        reason = peer.available()
+        print(f"skipped {peer.name}: {reason}" if reason else f"{peer.name}: {' '.join(peer.__doc__.split())}")
+        if not reason:
+            peers.append(peer)
+    return peers
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,83 @@
+"""This library: one jitted `daesolve`, from constraints as plain JAX functions; the sweep is `jit(vmap(daesolve))`."""
+
+import numpy as np
+
+from . import missing, problems
+
+
+name = "dae_jax"
+methods = (
+    "OrthogonalProjection(DOP853)",
+    "DOP853",
+    "OrthogonalProjection(Tsit5)",
+    "TangentSpace(DOP853)",
+    "StateSpace",
+)
+
+
+def available():
+    return missing("dae_jax")
+
+
+def double_pendulum(rtol, t1=10.0, method=methods[0]):
+    from dae_jax.scenes import double_pendulum
+
+    return _prepare(double_pendulum(), problems.chain_start(2), rtol, t1, method)
+
+
+def pendulum(rtol, t1=10.0, method=methods[0]):
+    from dae_jax.scenes import pendulum
+
+    return _prepare(pendulum(), problems.chain_start(1), rtol, t1, method)
+
+
+def chain(n, rtol, t1=1.0, method="DOP853"):
+    from dae_jax.scenes import chain
+
+    return _prepare(chain(n), problems.chain_start(n), rtol, t1, method)
+
+
+def sweep(angles, rtol, t1=10.0, method="OrthogonalProjection(DOP853)"):
+    from dae_jax.scenes import double_pendulum
+
+    return _prepare(double_pendulum(), problems.double_pendulum_starts(angles), rtol, t1, method, batch=True)
+
+
+def solution(scene, rtol, t1, method):
+    """A function of the start (flat, as in `problems`) that gives the `DAESolution`."""
+    import diffrax
+    import jax.numpy as jnp
+
+    import dae_jax
+
+    solver, formulation = {
+        "OrthogonalProjection(DOP853)": (dae_jax.OrthogonalProjection(dae_jax.DOP853()), None),
+        "DOP853": (dae_jax.DOP853(), None),
+        "OrthogonalProjection(Tsit5)": (dae_jax.OrthogonalProjection(diffrax.Tsit5()), None),
+        "TangentSpace(DOP853)": (dae_jax.TangentSpace(dae_jax.DOP853()), None),
+        "StateSpace": (dae_jax.DOP853(), dae_jax.StateSpace(scene.chart) if scene.chart else None),
+    }[method]
+
+    def solve(start, **options):
+        return dae_jax.daesolve(
+            scene.system, solver, 0.0, t1, None, tuple(jnp.split(start, 2)), scene.args, formulation=formulation,
+            stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol), max_steps=100_000, throw=False, **options
+        )  # fmt: skip
+
+    return solve
+
+
+def _prepare(scene, start, rtol, t1, method, batch=False):
+    import jax
+    import jax.numpy as jnp
+
+    jax.config.update("jax_enable_x64", True)
+    solve_from = solution(scene, rtol, t1, method)
+    end = lambda start: jnp.concatenate([x[-1] for x in solve_from(start).ys])
+    compiled = jax.jit(jax.vmap(end) if batch else end)
+    start = jnp.asarray(start)
+
+    def solve():
+        return compiled(start).block_until_ready()
+
+    return np.asarray(solve()), solve

@@ -1,0 +1,147 @@
+"""Wrong input is refused in a sentence, before anything is traced."""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .constraints import MechanicalODE
+from .formulations import AbstractFormulation, Differentiation, StateSpace
+from .initialise import redundancy, violation
+from .normals import SparseNormals
+from .solvers import RATTLE, AbstractManifoldSolver
+from .systems import ConstrainedSystem
+
+
+def checked(system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any) -> tuple[Any, Any]:
+    """`y0` and `args` as arrays, once their types and shapes are right."""
+    if not isinstance(system, ConstrainedSystem):
+        raise TypeError(f"`system` must be a dae_jax.ConstrainedSystem, but is a {type(system).__name__}.")
+    if not isinstance(y0, tuple | list) or len(y0) != 2:
+        raise ValueError(f"`y0` must be the pair (q, v) of positions and velocities, but is {_brief(y0)}.")
+    q, v = y0
+    if jax.tree.structure(q) != jax.tree.structure(v):
+        raise ValueError("`y0` = (q, v): q and v must have the same structure.")
+    for a, b in zip(jax.tree.leaves(q), jax.tree.leaves(v), strict=True):
+        if np.shape(a) != np.shape(b):
+            raise ValueError(
+                f"`y0` = (q, v): q and v must have the same shape, but have {np.shape(a)} and {np.shape(b)}."
+            )
+    for leaf in jax.tree.leaves(y0):
+        dtype = jnp.result_type(leaf)
+        if not jnp.issubdtype(dtype, jnp.floating):
+            raise ValueError(f"`y0` must hold floating-point numbers, but has {dtype}; write 1.0 in place of 1.")
+        if not isinstance(leaf, jax.core.Tracer) and not np.all(np.isfinite(np.asarray(leaf))):
+            raise ValueError(f"`y0` must be finite, but has NaN or infinity: {_brief(leaf)}.")
+    for name, value in (("t0", t0), ("t1", t1), ("dt0", dt0)):
+        if value is None and name == "dt0":
+            continue
+        if jnp.shape(value) != () or jnp.issubdtype(jnp.result_type(value), jnp.complexfloating):
+            raise ValueError(f"`{name}` must be a real number, but is {_brief(value)}.")
+        if not isinstance(value, jax.core.Tracer) and not np.isfinite(value):
+            raise ValueError(f"`{name}` must be finite, but is {value}.")
+    if dt0 is not None and not any(isinstance(x, jax.core.Tracer) for x in (t0, t1, dt0)) and (t1 - t0) * dt0 < 0:
+        raise ValueError(f"`dt0` = {dt0} points away from `t1` = {t1}: it must have the sign of t1 − t0.")
+    dtype = jnp.result_type(*jax.tree.leaves(y0))
+    y0 = jax.tree.map(lambda x: as_array(x, dtype), tuple(y0))
+    return y0, jax.tree.map(lambda x: np.asarray(x, jnp.result_type(x)) if isinstance(x, float) else x, args)
+
+
+def as_array(x: Any, dtype: Any) -> Any:
+    """`x` as an array; numbers stay numpy's, which costs less than the way to a device and back."""
+    if isinstance(x, jax.Array):
+        return x if x.dtype == dtype else x.astype(dtype)
+    return np.asarray(x, dtype)
+
+
+def _brief(x: Any) -> str:
+    text = repr(x)
+    return text if len(text) < 200 else text[:200] + "…"
+
+
+def refuse_misfits(system: Any, formulation: Any, solver: Any, t0: Any, y0: Any, args: Any) -> None:
+    """Refuses pairs of formulation and solver that make no sense, and shapes that do not fit."""
+    if not isinstance(solver, diffrax.AbstractSolver):
+        raise TypeError(f"`solver` must be a diffrax solver such as diffrax.Tsit5(), but is {_brief(solver)}.")
+    if not isinstance(formulation, AbstractFormulation):
+        raise TypeError(
+            f"`formulation` must be a formulation such as dae_jax.Baumgarte(...), but is {_brief(formulation)}."
+        )
+    if isinstance(formulation, StateSpace) and isinstance(solver, AbstractManifoldSolver):
+        raise ValueError(
+            f"StateSpace has no constraints left for {type(solver).__name__} to keep: in its chart they hold by "
+            "construction. Use the inner solver itself."
+        )
+    if isinstance(solver, RATTLE):
+        _fits_rattle(system, formulation, t0, y0, args)
+
+
+def _fits_rattle(system: ConstrainedSystem, formulation: Any, t0: Any, y0: Any, args: Any) -> None:
+    if callable(system.mass):
+        raise ValueError("RATTLE needs a constant mass matrix, but `mass` is a function; use SymmetricProjection.")
+    if system.nonholonomic is not None:
+        raise ValueError("RATTLE takes holonomic constraints only; use SymmetricProjection for nonholonomic ones.")
+    if not isinstance(formulation, Differentiation):
+        raise ValueError(f"RATTLE has its own treatment of the constraints and takes no {type(formulation).__name__}.")
+    q, v = y0
+    arrays, static = eqx.partition(args, eqx.is_array)
+    jaxpr = jax.make_jaxpr(lambda v, q, a: system.force(t0, q, v, eqx.combine(a, static)))(v, q, arrays).jaxpr
+    velocities = jaxpr.invars[: len(jax.tree.leaves(v))]
+    used = [x for eqn in jaxpr.eqns for x in eqn.invars] + list(jaxpr.outvars)
+    if any(x is velocity for x in used for velocity in velocities):
+        raise ValueError("RATTLE needs a force that does not depend on v; use SymmetricProjection.")
+
+
+def refuse_bad_times(saveat: Any, t0: Any, t1: Any) -> None:
+    """Times to save at must lie in the interval, in the order in which they are passed."""
+    for sub in saved_parts(saveat):
+        if sub.ts is not None:
+            ts = np.asarray(sub.ts)
+            low, high = min(t0, t1), max(t0, t1)
+            if ts.size and (ts.min() < low or ts.max() > high):
+                raise ValueError(
+                    f"`saveat.ts` must lie between t0 = {t0} and t1 = {t1}, but spans {ts.min()} to {ts.max()}."
+                )
+            steps = np.diff(ts) * (1 if t1 >= t0 else -1)
+            if np.any(steps < 0):
+                raise ValueError("`saveat.ts` must be in the order in which the solve passes them.")
+
+
+def refuse_bad_start(system: Any, t0: Any, y0: Any, args: Any) -> int | None:
+    """Refuses an inconsistent start in words; the rank of the constraints if some are redundant."""
+    found, redundant = _look(system, t0, y0, args)
+    if not bool(found.consistent()):
+        raise ValueError(
+            found.message()
+            + "\n`dae_jax.consistent_state(system, t0, y0, args)` gives the nearest state that does not."
+        )
+    count = found.residuals[1].shape[0]
+    if system.rank is not None or redundant is None:
+        return system.rank
+    rank = int(redundant.rank)
+    if rank < count and float(redundant.contradiction) > 1e-6:
+        raise ValueError(
+            f"Only {rank} of the {count} constraints are independent at the start, and the others contradict them: no "
+            "acceleration satisfies all. Remove the redundant constraints or make them agree."
+        )
+    return rank if rank < count else None
+
+
+@eqx.filter_jit
+def _look(system: Any, t: Any, y0: Any, args: Any) -> Any:
+    ode = MechanicalODE.of(system, t, y0, args)
+    y = ode.encode(y0)
+    return violation(ode, t, y), None if isinstance(ode.linear, SparseNormals) else redundancy(ode, t, y)
+
+
+def saved_parts(saveat: Any) -> list[Any]:
+    """The `SubSaveAt`s of a `SaveAt`."""
+    return [s for s in jax.tree.leaves(saveat.subs, is_leaf=is_saved_part) if is_saved_part(s)]
+
+
+def is_saved_part(x: Any) -> bool:
+    """For `jax.tree.map`."""
+    return isinstance(x, diffrax.SubSaveAt)

@@ -1,0 +1,173 @@
+"""What a solve will do, in words: what was found in the system, what is therefore left out, and how it is compiled."""
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .checks import refuse_bad_start
+from .constraints import MechanicalODE
+from .formulations import AbstractFormulation
+from .kernels import equations, hindrances, one_kernel_enabled, without_checks
+from .linalg.semidefinite import LOOPED, UNROLLED
+from .normals import SparseNormals
+from .program import Solve
+from .solve import prepared
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """How a system is solved; `print` it.
+
+    - `method`: formulation and solver, in words.
+    - `coordinates`, `constraints`, `independent`: counts; `independent` is `None` where the start is traced.
+    - `mass`: "unit", "diagonal" or "matrix", and whether it depends on q.
+    - `constraints_depend_on_time`.
+    - `linear_solver`: how the multipliers are found.
+    - `nonzeros`, `colours`: nonzeros of the constraints' Jacobian, and the directional derivatives that it takes; `None`
+      where it is dense.
+    - `operations`: primitive operations of one evaluation of the field, as it is compiled.
+    - `one_kernel`: whether the whole loop is compiled to one kernel; `hindrances`: the primitives that prevent it.
+    - `left_out`: what other systems need and this one does not.
+    """
+
+    method: str
+    coordinates: int
+    constraints: int
+    independent: int | None
+    mass: str
+    constraints_depend_on_time: bool
+    linear_solver: str
+    nonzeros: int | None
+    colours: int | None
+    operations: int
+    one_kernel: bool
+    hindrances: tuple[str, ...]
+    left_out: tuple[str, ...]
+
+    def __str__(self) -> str:
+        independent = self.constraints if self.independent is None else self.independent
+        redundant = "" if independent == self.constraints else f", {independent} of them independent"
+        kernel = "yes" if self.one_kernel else "no: " + (", ".join(self.hindrances) or "switched off, or not on a CPU")
+        jacobian = "dense, by forward-mode derivatives"
+        if self.colours is not None:
+            jacobian = f"{self.nonzeros} nonzeros from {self.colours} directional derivatives"
+        rows = {
+            "method": self.method,
+            "system": f"{self.coordinates} coordinates, {self.constraints} constraints{redundant}",
+            "mass": self.mass,
+            "time": "constraints depend on time"
+            if self.constraints_depend_on_time
+            else "constraints are fixed in time",
+            "constraint Jacobian": jacobian,
+            "multipliers": self.linear_solver,
+            "field": f"{self.operations} operations",
+            "one kernel": kernel,
+            "left out": "; ".join(self.left_out) or "nothing",
+        }
+        return "\n".join(f"{name:>20}  {text}" for name, text in rows.items())
+
+
+def explain(
+    system: Any,
+    solver: diffrax.AbstractSolver,
+    t0: Any,
+    y0: Any,
+    args: Any = None,
+    *,
+    formulation: AbstractFormulation | None = None,
+    saveat: diffrax.SaveAt = diffrax.SaveAt(t1=True),  # noqa: B008
+    stepsize_controller: diffrax.AbstractStepSizeController | None = None,
+    adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint(),  # noqa: B008
+    event: diffrax.Event | None = None,
+    progress_meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter(),  # noqa: B008
+) -> Plan:
+    """How `daesolve` would solve this, with the same arguments; nothing is solved.
+
+    Errors: those of `daesolve` for wrong input.
+    """
+    dt0 = None if isinstance(solver, diffrax.AbstractAdaptiveSolver) else 1e-3
+    inputs = prepared(
+        system, solver, t0, t0 + 1.0, dt0, y0, args, formulation, saveat, stepsize_controller, adjoint, event, 4096,
+        progress_meter,
+    )  # fmt: skip
+    inputs = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray | np.generic) else x, inputs)
+    solve, system, t0, _, _, y0, args = inputs
+    traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(inputs))
+    rank = system.rank if traced else refuse_bad_start(system, t0, y0, args)
+    kernel, arrays, _ = solve.kernel(*inputs[1:], rank)
+    found = hindrances(jax.make_jaxpr(without_checks(kernel))(arrays))
+    enabled = one_kernel_enabled() and jax.default_backend() == "cpu" and solve.derivative() != "any"
+    ode = MechanicalODE.of(system, t0, y0, args, rank)
+    count = ode.holonomic + ode.nonholonomic
+    sparse = ode.linear if isinstance(ode.linear, SparseNormals) else None
+    y = ode.encode(y0)
+    return Plan(
+        method=f"{_name(solve.formulation)}, {_name(solver)}",
+        coordinates=ode.layout.size,
+        constraints=count,
+        independent=None if traced else rank or count,
+        mass=_mass(system, ode.mass(y[0])),
+        constraints_depend_on_time=any(ode.depends_on_time),
+        linear_solver=_linear_solver(ode, count, rank),
+        nonzeros=None if sparse is None else int((sparse.columns >= 0).sum()),
+        colours=None if sparse is None else len(sparse.columns),
+        operations=_operations(lambda y: ode.field(t0, y), y),
+        one_kernel=enabled and not found,
+        hindrances=found,
+        left_out=tuple(_left_out(system, ode, solve)),
+    )
+
+
+def _name(module: Any) -> str:
+    inner = getattr(module, "solver", None)
+    return type(module).__name__ + (f"({_name(inner)})" if inner is not None else "")
+
+
+def _mass(system: Any, mass: Any) -> str:
+    kind = "unit masses" if mass is None else "diagonal masses" if mass.ndim < 2 else "a full mass matrix"
+    return kind + (" that depend on q" if callable(system.mass) else "")
+
+
+def _linear_solver(ode: MechanicalODE, count: int, rank: int | None) -> str:
+    if isinstance(ode.linear, SparseNormals):
+        gram = ode.linear.gram
+        return f"sparse elimination in {len(gram.levels)} levels, {gram.cost} multiplications" + (
+            f", then a dense system of {gram.rest_size}" if gram.rest_size > 1 else ""
+        )
+    if rank is not None:
+        return f"least norm by eigenvalues, rank {rank} of {count} (LAPACK)"
+    kind = "straight-line" if count <= UNROLLED else "a loop over columns" if count <= LOOPED else "Cholesky (LAPACK)"
+    return f"dense elimination of {count} unknowns, {kind}"
+
+
+def _left_out(system: Any, ode: MechanicalODE, solve: Solve) -> Iterator[str]:
+    if system.mass is None:
+        yield "mass solve"
+    if not any(ode.depends_on_time):
+        yield "time derivatives of the constraints"
+    if not ode.nonholonomic:
+        yield "nonholonomic constraints"
+    yield "multipliers as output"
+    if not solve.between():
+        yield "dense output"
+
+
+def _operations(fn: Callable[..., Any], *args: Any) -> int:
+    """How many primitive operations a function has, those that only move data left out."""
+    moved = {
+        "reshape",
+        "squeeze",
+        "broadcast_in_dim",
+        "slice",
+        "concatenate",
+        "transpose",
+        "convert_element_type",
+        "copy",
+    }
+    names = [eqn.primitive.name for eqn in equations(jax.make_jaxpr(fn)(*args))]
+    return sum(name not in moved and name not in ("jit", "pjit", "stack") for name in names)

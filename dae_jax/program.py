@@ -1,0 +1,227 @@
+"""A solve as a compiled program: what is traced once for a system and a method, and run on numbers."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix
+
+from .checks import is_saved_part, saved_parts
+from .constraints import MechanicalODE
+from .formulations import AbstractFormulation
+from .initialise import redundancy, violation
+from .kernels import one_kernel, one_kernel_enabled
+from .linalg import rms_norm
+from .solution import RESULTS, DAESolution, Interpolation, all_finite
+from .solvers import DOP853, AbstractManifoldSolver, OrthogonalProjection, TangentSpace, unrolled
+from .solvers.tangent_space import TangentPoint
+
+
+class Program(NamedTuple):
+    """All of a solve but its arrays: hashable, and different for 1 and 1.0."""
+
+    treedef: Any
+    leaves: tuple[Any, ...]
+    types: tuple[type, ...]
+    one_kernel: bool
+
+    def inputs(self, arrays: list[Any]) -> Any:
+        """The inputs with these arrays."""
+        rest = iter(arrays)
+        return jax.tree.unflatten(self.treedef, [next(rest) if x is _ARRAY else x for x in self.leaves])
+
+
+_ARRAY = object()
+
+
+def split(inputs: Any) -> tuple[Program, list[Any]]:
+    """The inputs of a solve as a program and its arrays."""
+    leaves, treedef = jax.tree.flatten(inputs)
+    arrays = [x for x in leaves if isinstance(x, jax.Array | np.ndarray | np.generic)]
+    static = tuple(_ARRAY if isinstance(x, jax.Array | np.ndarray | np.generic) else x for x in leaves)
+    return Program(treedef, static, tuple(map(type, static)), one_kernel_enabled()), arrays
+
+
+class _Static(eqx.Module):
+    """What a jitted function returns that is not an array."""
+
+    value: Any = eqx.field(static=True)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _jitted(program: Program, rank: int | None, arrays: list[Any]) -> Any:
+    solve, *inputs = program.inputs(jax.tree.map(jnp.asarray, arrays))
+    sol, as_expected = solve(*inputs, rank)
+    numbers, rest = eqx.partition(sol, eqx.is_array)
+    return numbers, _Static(rest), as_expected
+
+
+def run(program: Program, rank: int | None, arrays: list[Any]) -> tuple[DAESolution, Any]:
+    """The solution, and whether the start was consistent and of the given rank."""
+    numbers, rest, as_expected = _jitted(program, rank, arrays)
+    return eqx.combine(numbers, rest.value), as_expected
+
+
+class _Decode(eqx.Module):
+    """The user's view of a point of the solver's dense output."""
+
+    formulation: AbstractFormulation
+    solver: diffrax.AbstractSolver
+
+    def __call__(self, t: Any, y: Any, ode: Any) -> Any:
+        if isinstance(self.solver, AbstractManifoldSolver):
+            y = self.solver.land(t, y, ode)
+        return self.formulation.decode(t, y, ode)
+
+
+class Solve(eqx.Module):
+    """All that is fixed about a solve, as one callable for `jit`."""
+
+    formulation: AbstractFormulation
+    solver: diffrax.AbstractSolver
+    saveat: diffrax.SaveAt
+    controller: diffrax.AbstractStepSizeController
+    adjoint: diffrax.AbstractAdjoint
+    event: diffrax.Event | None
+    max_steps: int | None = eqx.field(static=True)
+    progress_meter: diffrax.AbstractProgressMeter
+
+    def __call__(
+        self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, rank: int | None
+    ) -> tuple[DAESolution, Any]:
+        numbers, arrays, outline = self.kernel(system, t0, t1, dt0, y0, args, rank)
+        out = one_kernel(numbers, self.derivative())(arrays)
+        ode = MechanicalODE.of(system, t0, y0, args, rank)
+        start = ode.encode(y0)
+        consistent = violation(ode, t0, start).consistent()
+        sol = self._solution(eqx.combine(out, outline[0]), args, rank, consistent)
+        return sol, consistent if rank is None else consistent & (redundancy(ode, t0, start).rank == rank)
+
+    def kernel(
+        self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, rank: int | None
+    ) -> tuple[Callable[[Any], Any], Any, list[Any]]:
+        """What can become one kernel: a function of arrays, its arrays, and a list that holds, once the function has been
+        traced, what of its result is not an array.
+        """
+        arrays, static = eqx.partition((self, system, t0, t1, dt0, y0, args), eqx.is_array)
+        outline: list[Any] = []
+
+        def numbers(arrays: Any) -> Any:
+            solve, *rest = eqx.combine(arrays, static)
+            out, fixed = eqx.partition(solve._diffeqsolve(*rest, rank), eqx.is_array)
+            outline[:] = [fixed]
+            return out
+
+        return numbers, arrays, outline
+
+    def derivative(self) -> Any:
+        """In which mode the adjoint allows derivatives; a progress meter needs callbacks."""
+        if not isinstance(self.progress_meter, diffrax.NoProgressMeter):
+            return "any"
+        if isinstance(self.adjoint, diffrax.ForwardMode):
+            return "forward"
+        return "reverse" if isinstance(self.adjoint, diffrax.RecursiveCheckpointAdjoint) else "any"
+
+    def between(self) -> bool:
+        """Whether points between steps are asked for."""
+        return (
+            self.saveat.dense or any(part.ts is not None for part in saved_parts(self.saveat)) or self.event is not None
+        )
+
+    def _diffeqsolve(self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, rank: int | None) -> Any:
+        y, ode = self.formulation.encode(system, t0, y0, args, rank)
+        decode = _Decode(self.formulation, self.solver)
+
+        def saved(sub: Any) -> Any:
+            fn = sub.fn
+            view = lambda t, y, ode: fn(t, decode(t, y, ode), args)
+            return eqx.tree_at(lambda s: s.fn, sub, view) if is_saved_part(sub) else sub
+
+        saveat = eqx.tree_at(
+            lambda s: s.subs,
+            self.saveat,
+            jax.tree.map(saved, self.saveat.subs, is_leaf=is_saved_part),
+            is_leaf=lambda x: x is None,
+        )
+        event = self.event and dataclasses.replace(
+            self.event,
+            cond_fn=jax.tree.map(lambda c: _on_states(c, decode, args), self.event.cond_fn, is_leaf=callable),
+        )
+        sol = diffrax.diffeqsolve(
+            self.formulation.term(),
+            _economical(self.solver, self.between()),
+            t0, t1, dt0, y,
+            args=ode, saveat=saveat, stepsize_controller=_fitted(self.controller, t0, t1), adjoint=self.adjoint, event=event,
+            max_steps=self.max_steps, throw=False, progress_meter=self.progress_meter,
+        )  # fmt: skip
+        interpolation = None
+        if sol.interpolation is not None:
+            interpolation = Interpolation(_uniform(self.solver, sol.interpolation), decode, ode)
+        return sol.t0, sol.t1, sol.ts, sol.ys, interpolation, sol.stats, sol.result, sol.event_mask
+
+    def _solution(self, out: Any, args: Any, rank: int | None, consistent: Any) -> DAESolution:
+        *fields, result, event_mask = out
+        code = RESULTS.promote(result)
+        _, _, ts, ys, *_ = fields
+        failed = lambda name, instead, when=True: RESULTS.where((code == name) & when, instead, code)
+        code = failed(RESULTS.dt_min_reached, RESULTS.step_rejected)
+        code = failed(RESULTS.nonlinear_divergence, RESULTS.off_manifold)
+        if ts is not None:
+            finite = [all_finite(*pair) for pair in _saved(self.saveat, ts, ys)]
+            code = failed(RESULTS.successful, RESULTS.not_finite, ~jnp.all(jnp.stack(finite))) if finite else code
+        code = RESULTS.where(consistent, code, RESULTS.inconsistent_start)
+        return DAESolution(*fields, code, event_mask, args, rank)
+
+
+def _saved(saveat: Any, ts: Any, ys: Any) -> list[tuple[Any, Any]]:
+    """The (times, states) of each part of `saveat`."""
+    structure = jax.tree.structure(saveat.subs, is_leaf=is_saved_part)
+    return [
+        (t, y) for t, y in zip(structure.flatten_up_to(ts), structure.flatten_up_to(ys), strict=True) if t is not None
+    ]
+
+
+def _fitted(controller: Any, t0: Any, t1: Any) -> Any:
+    """The controller with a smallest step at the resolution of time, below which a solve cannot get on, and its default
+    norm without a library call.
+    """
+    if type(controller) is not diffrax.PIDController:
+        return controller
+    if controller.norm is optimistix.rms_norm:
+        controller = dataclasses.replace(controller, norm=rms_norm)
+    if controller.dtmin is not None:
+        return controller
+    floor = 16 * jnp.finfo(jnp.result_type(t0)).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+    return dataclasses.replace(controller, dtmin=floor, force_dtmin=False)
+
+
+def _uniform(solver: Any, path: diffrax.DenseInterpolation) -> diffrax.DenseInterpolation:
+    """The dense output with one type of point, also for an interval of length 0."""
+    if not isinstance(solver, TangentSpace):
+        return path
+    first = TangentPoint(path.y0_if_trivial, jax.tree.map(lambda x: x[0], path.infos["normals"]))
+    return eqx.tree_at(lambda p: p.y0_if_trivial, path, first)
+
+
+def _on_states(cond: Callable[..., Any], decode: Any, args: Any) -> Callable[..., Any]:
+    user_args = args
+
+    def condition(t: Any, y: Any, args: Any, **kwargs: Any) -> Any:
+        return cond(t, decode(t, y, args), user_args, **kwargs)
+
+    return condition
+
+
+def _economical(solver: Any, between: bool) -> Any:
+    """The solver without what this solve does not need, with its stages written out."""
+    if isinstance(solver, OrthogonalProjection | TangentSpace):
+        return dataclasses.replace(solver, solver=_economical(solver.solver, between))
+    if isinstance(solver, DOP853):
+        return dataclasses.replace(solver, dense=between)
+    return unrolled(solver)
