@@ -16,11 +16,12 @@ from .checks import is_saved_part, saved_parts
 from .constraints import MechanicalODE
 from .formulations import AbstractFormulation
 from .initialise import redundancy, violation
-from .kernels import one_kernel, one_kernel_enabled
+from .kernels import PullBack, inexact, one_kernel, one_kernel_enabled
 from .linalg import rms_norm
 from .solution import RESULTS, DAESolution, Interpolation, all_finite
 from .solvers import DOP853, AbstractManifoldSolver, OrthogonalProjection, TangentSpace, unrolled
 from .solvers.tangent_space import TangentPoint
+from .tape import Taped, as_it_is, can_be_taped, cotangents, recorded, saved_times
 
 
 class Program(NamedTuple):
@@ -80,6 +81,17 @@ class _Decode(eqx.Module):
         return self.formulation.decode(t, y, ode)
 
 
+class _View(eqx.Module):
+    """What is saved of a point of the solver's dense output."""
+
+    fn: Callable[..., Any]
+    decode: _Decode
+    args: Any
+
+    def __call__(self, t: Any, y: Any, ode: Any) -> Any:
+        return self.fn(t, self.decode(t, y, ode), self.args)
+
+
 class Solve(eqx.Module):
     """All that is fixed about a solve, as one callable for `jit`."""
 
@@ -96,7 +108,7 @@ class Solve(eqx.Module):
         self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, rank: int | None
     ) -> tuple[DAESolution, Any]:
         numbers, arrays, outline = self.kernel(system, t0, t1, dt0, y0, args, rank)
-        out = one_kernel(numbers, self.derivative())(arrays)
+        out = one_kernel(numbers, self.derivative(), self._pull_back(system, t0, t1, dt0, y0, args, rank))(arrays)
         ode = MechanicalODE.of(system, t0, y0, args, rank)
         start = ode.encode(y0)
         consistent = violation(ode, t0, start).consistent()
@@ -120,6 +132,41 @@ class Solve(eqx.Module):
 
         return numbers, arrays, outline
 
+    def _pull_back(
+        self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, rank: int | None
+    ) -> PullBack | None:
+        """The reverse derivative from a tape, where it applies."""
+        size = sum(leaf.size for leaf in jax.tree.leaves(y0))
+        if self.derivative() != "reverse" or not can_be_taped(self, size):
+            return None
+        _, static = eqx.partition((self, system, t0, t1, dt0, y0, args), eqx.is_array)
+
+        def pull_back(inputs: Any, cotangent: Any) -> list[Any]:
+            solve, *rest = eqx.combine(inputs[0], static)
+            _, _, ts, ys, *_ = dataclasses.replace(solve, saveat=recorded(solve.saveat))._diffeqsolve(*rest, rank)
+            numbers, others = eqx.partition(inputs[0], eqx.is_inexact_array)
+            fixed: list[Any] = []
+
+            def encoded(numbers: Any) -> Any:
+                solve, *inputs = eqx.combine(numbers, others, static)
+                found, fixed[:] = eqx.partition(solve._taped(*inputs, rank), eqx.is_inexact_array)
+                return found
+
+            found, through_encoding = jax.vjp(encoded, numbers)
+            of_t0, of_t1, of_ts, of_ys, *_ = cotangent
+            fixed_steps = isinstance(self.controller, diffrax.ConstantStepSize)
+            of_taped = cotangents(eqx.combine(found, Taped(*fixed)), fixed_steps, (ts["tape"], ys["tape"]), of_ys)
+            return inexact(through_encoding(saved_times(of_taped, self.saveat.subs, of_t0, of_t1, of_ts))[0])
+
+        return pull_back
+
+    def _taped(self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, rank: int | None) -> Taped:
+        y, ode = self.formulation.encode(system, t0, y0, args, rank)
+        part = self.saveat.subs
+        solver = _economical(self.solver, self.between())
+        view = _View(part.fn, _Decode(self.formulation, self.solver), args)
+        return Taped(self.formulation, solver, part, t0, t1, y, ode, view)
+
     def derivative(self) -> Any:
         """In which mode the adjoint allows derivatives; a progress meter needs callbacks."""
         if not isinstance(self.progress_meter, diffrax.NoProgressMeter):
@@ -138,10 +185,8 @@ class Solve(eqx.Module):
         y, ode = self.formulation.encode(system, t0, y0, args, rank)
         decode = _Decode(self.formulation, self.solver)
 
-        def saved(sub: Any) -> Any:
-            fn = sub.fn
-            view = lambda t, y, ode: fn(t, decode(t, y, ode), args)
-            return eqx.tree_at(lambda s: s.fn, sub, view) if is_saved_part(sub) else sub
+        def saved(part: Any) -> Any:
+            return part if part.fn is as_it_is else eqx.tree_at(lambda s: s.fn, part, _View(part.fn, decode, args))
 
         saveat = eqx.tree_at(
             lambda s: s.subs,

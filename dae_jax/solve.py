@@ -91,9 +91,11 @@ def _run_on_numbers(program: Program, arrays: list[Any], inputs: Any) -> DAESolu
     solve, system, t0, t1, _, y0, args = inputs
     refuse_bad_times(solve.saveat, t0, t1)
     if program not in _ranks:
-        _ranks[program] = refuse_bad_start(system, t0, y0, args)
+        with jax.ensure_compile_time_eval():
+            _ranks[program] = refuse_bad_start(system, t0, y0, args)
     sol, as_expected = run(program, _ranks[program], arrays)
-    if not as_expected:
+    # Inside an outer `jit` the result is no number, although the inputs are.
+    if not isinstance(as_expected, jax.core.Tracer) and not as_expected:
         _ranks[program] = refuse_bad_start(system, t0, y0, args)
         sol, _ = run(program, _ranks[program], arrays)
     return sol

@@ -2,10 +2,11 @@
 
 import jax
 import jax.numpy as jnp
+import jax.test_util
 import numpy as np
 import pytest
 
-from dae_jax.linalg import newton, semidefinite_solve, solve
+from dae_jax.linalg import elimination, newton, rms_norm, semidefinite_solve, solve
 from dae_jax.linalg.semidefinite import LOOPED, UNROLLED
 
 
@@ -205,3 +206,84 @@ class TestNewton:
         x, converged = jax.vmap(lambda p: newton(cube, jnp.array([2.5]), p))(p)
         assert converged.all()
         np.testing.assert_allclose(x[:, 0], [1.0, 2.0, 3.0], rtol=1e-14)
+
+
+def path(n, *, closed=False):
+    pattern = np.eye(n, dtype=bool)
+    pattern[np.arange(n - 1), np.arange(1, n)] = True
+    pattern[0, n - 1] |= closed
+    return pattern | pattern.T
+
+
+def tree(n):
+    pattern = np.eye(n, dtype=bool)
+    pattern[(np.arange(1, n) - 1) // 2, np.arange(1, n)] = True
+    return pattern | pattern.T
+
+
+def star(n):
+    pattern = np.eye(n, dtype=bool)
+    pattern[0] = True
+    return pattern | pattern.T
+
+
+def band(n, width):
+    return np.abs(np.subtract.outer(np.arange(n), np.arange(n))) <= width
+
+
+PATTERNS = {
+    "chain": path(40),
+    "closed chain": path(33, closed=True),
+    "tree": tree(60),
+    "star": star(30),
+    "band": band(30, 3),
+    "dense": np.ones((9, 9), bool),
+    "ring of three": path(3, closed=True),
+    "single": np.eye(1, dtype=bool),
+    "uncoupled": np.eye(5, dtype=bool),
+}
+
+
+def sparse(pattern, seed=0):
+    A = np.where(pattern, np.random.default_rng(seed).normal(size=pattern.shape), 0)
+    return A + A.T + 2 * np.diag(np.abs(A + A.T).sum(1) + 0.1)
+
+
+class TestElimination:
+    @pytest.mark.parametrize("name", PATTERNS)
+    def test_equals_numpy(self, name):
+        order, S = elimination(PATTERNS[name]), sparse(PATTERNS[name])
+        b = right(len(S))
+        x = order.solve(jnp.diag(jnp.array(S)), jnp.array(S[order.rows, order.columns]), jnp.array(b))
+        np.testing.assert_allclose(x, np.linalg.solve(S, b), rtol=1e-12, atol=1e-14)
+
+    @pytest.mark.parametrize(("make", "most"), [(path, 30), (tree, 30), (lambda n: path(n, closed=True), 40)])
+    def test_cost_grows_linearly(self, make, most):
+        assert elimination(make(256)).cost < most * 256
+        assert elimination(make(1024)).cost < 4.5 * elimination(make(256)).cost
+
+    def test_derivatives_in_both_modes(self):
+        order, S, b = elimination(tree(20)), sparse(tree(20)), right(20)
+        solve = lambda d, c, b: order.solve(d, c, b)
+        args = (jnp.diag(jnp.array(S)), jnp.array(S[order.rows, order.columns]), jnp.array(b))
+        jax.test_util.check_grads(solve, args, order=1, rtol=1e-6)
+
+    def test_vmap_is_one_at_a_time(self):
+        order, S = elimination(path(12)), sparse(path(12))
+        bs = right(3, 12)
+        d, c = jnp.diag(jnp.array(S)), jnp.array(S[order.rows, order.columns])
+        together = jax.vmap(lambda b: order.solve(d, c, b))(jnp.array(bs))
+        np.testing.assert_allclose(together, np.linalg.solve(S, bs.T).T, rtol=1e-12)
+
+    def test_singular_is_nan(self):
+        S = np.array([[1.0, -1, 0], [-1, 2, -1], [0, -1, 1]])
+        order = elimination(S != 0)
+        x = order.solve(jnp.diag(jnp.array(S)), jnp.array(S[order.rows, order.columns]), jnp.ones(3))
+        assert np.isnan(x).any()
+
+
+class TestRmsNorm:
+    def test_value_and_derivative_at_zero(self):
+        x = {"a": jnp.array([3.0, 4.0]), "b": jnp.zeros((2, 1))}
+        np.testing.assert_allclose(rms_norm(x), 2.5)
+        assert (jax.grad(lambda x: rms_norm(x))(jnp.zeros(3)) == 0).all()

@@ -1,9 +1,11 @@
 """How small functions become fast machine code: scalar arithmetic and single kernels."""
 
 from .one_kernel import (
+    PullBack as PullBack,
     configure as configure,
     equations as equations,
     hindrances as hindrances,
+    inexact as inexact,
     one_kernel as one_kernel,
     one_kernel_enabled as one_kernel_enabled,
     without_checks as without_checks,

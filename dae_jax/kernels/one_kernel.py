@@ -19,6 +19,8 @@ from jax.custom_batching import custom_vmap
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
 
+from .subroutine import subroutine
+
 
 # What XLA:CPU cannot emit inside a single function: library calls, host callbacks, collectives, sorts.
 _REFUSED = frozenset(
@@ -144,44 +146,64 @@ def _is_check(eqn: Any) -> bool:
     return getattr(callback, "__module__", None) == "equinox._errors"
 
 
-def one_kernel(fn: Callable[..., Any], derivative: Literal["forward", "reverse", "any"] = "any") -> Callable[..., Any]:
+PullBack = Callable[[Any, Any], list[Any]]
+
+
+def one_kernel(
+    fn: Callable[..., Any],
+    derivative: Literal["forward", "reverse", "any"] = "any",
+    pull_back: PullBack | None = None,
+) -> Callable[..., Any]:
     """`fn` (pytrees of arrays to a pytree of arrays), compiled to one kernel on the CPU where it qualifies.
 
     On another backend, or where `hindrances` finds a reason, it is `fn` itself. Under `vmap` the batched function is
-    looked at afresh. `derivative` says in which mode `fn` can be differentiated: the forward derivative is again one
-    kernel where it qualifies, a reverse derivative is that of the plain `fn`, and "any" is the plain `fn` throughout.
+    looked at afresh. `derivative` says in which mode `fn` can be differentiated: its derivative is again one kernel
+    where it qualifies; with "any" it is the plain `fn` throughout. `pull_back(args, cotangent)` gives the cotangents of
+    those leaves of `args` that are inexact, where a better way than JAX's is known.
     """
     if not _enabled.get() or jax.default_backend() != "cpu" or derivative == "any":
         return fn
-    return _forward(fn) if derivative == "forward" else _reverse(fn)
+    return _forward(fn) if derivative == "forward" else _reverse(fn, pull_back or _plain_pull_back(fn))
 
 
-def _reverse(fn: Callable[..., Any]) -> Callable[..., Any]:
-    def flat(*args: Any) -> Any:
-        # The custom rule sees a flat list, so that integer leaves can have no cotangent.
+def _plain_pull_back(fn: Callable[..., Any]) -> PullBack:
+    def pull_back(args: Any, cotangent: Any) -> list[Any]:
         leaves, treedef = jax.tree.flatten(args)
-        inexact = [jnp.issubdtype(jnp.result_type(x), jnp.inexact) for x in leaves]
+        exact = [not jnp.issubdtype(jnp.result_type(x), jnp.inexact) for x in leaves]
+
+        def of_inexact(*zs: Any) -> list[Any]:
+            rest = iter(zs)
+            merged = [x if e else next(rest) for e, x in zip(exact, leaves, strict=True)]
+            return inexact(fn(*jax.tree.unflatten(treedef, merged)))
+
+        return list(jax.vjp(of_inexact, *inexact(args))[1](inexact(cotangent)))
+
+    return pull_back
+
+
+def _reverse(fn: Callable[..., Any], pull_back: PullBack) -> Callable[..., Any]:
+    def flat(*args: Any) -> Any:
+        # The custom rule sees a flat list, so that integers can have no cotangent.
+        leaves, treedef = jax.tree.flatten(args)
 
         @jax.custom_vjp
         def solve(*xs: Any) -> Any:
-            return _fused(lambda *ys: fn(*jax.tree.unflatten(treedef, ys)))(*xs)
+            return _fused(fn)(*jax.tree.unflatten(treedef, xs))
 
-        def forward(*xs: Any) -> Any:
-            def of_inexact(*zs: Any) -> Any:
-                rest = iter(zs)
-                merged = [next(rest) if i else x for i, x in zip(inexact, xs, strict=True)]
-                return fn(*jax.tree.unflatten(treedef, merged))
+        def backward(xs: Any, cotangent: Any) -> tuple[Any, ...]:
+            known = jax.tree.map(lambda c: None if c.dtype == jax.dtypes.float0 else c, cotangent)
+            found = iter(_fused(pull_back)(jax.tree.unflatten(treedef, xs), known))
+            return tuple(next(found) if jnp.issubdtype(jnp.result_type(x), jnp.inexact) else None for x in xs)
 
-            return jax.vjp(of_inexact, *(x for i, x in zip(inexact, xs, strict=True) if i))
-
-        def backward(pullback: Any, cotangent: Any) -> Any:
-            cotangents = iter(pullback(cotangent))
-            return tuple(next(cotangents) if i else None for i in inexact)
-
-        solve.defvjp(forward, backward)
+        solve.defvjp(lambda *xs: (solve(*xs), xs), backward)
         return solve(*leaves)
 
     return flat
+
+
+def inexact(tree: Any) -> list[Any]:
+    """The leaves that have derivatives."""
+    return [x for x in jax.tree.leaves(tree) if jnp.issubdtype(jnp.result_type(x), jnp.inexact)]
 
 
 def _forward(fn: Callable[..., Any]) -> Callable[..., Any]:
@@ -236,5 +258,6 @@ def _compile(fn: Callable[..., Any], args: Any, batched: bool = False) -> Any:
     # Of the scatters only the update of one row becomes a copy, and that for certain only where nothing is batched.
     if hindrances(jaxpr) or (batched and any(e.primitive.name.startswith("scatter") for e in equations(jaxpr))):
         return call(*args)
+    # The kernel has nothing but a call in it: XLA aborts where one of its parameters is not the operand of anything.
     with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
-        return call(*args)
+        return jax.jit(lambda *xs: subroutine(jaxpr_as_fun(jaxpr))(*xs))(*args)

@@ -3,6 +3,7 @@
 from .dop853 import DOP853 as DOP853
 from .explicit import unrolled as unrolled
 from .gauss import Gauss4 as Gauss4
+from .implicit import AbstractImplicitSolver as AbstractImplicitSolver
 from .manifold import AbstractManifoldSolver as AbstractManifoldSolver
 from .midpoint import Midpoint as Midpoint
 from .orthogonal_projection import OrthogonalProjection as OrthogonalProjection

@@ -1,0 +1,84 @@
+"""The reverse derivative from a tape is that of diffrax's checkpoints."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dae_jax
+from dae_jax.scenes import chain, pendulum
+from dae_jax.tape import LARGEST_TAPE, can_be_taped
+
+
+SCENE = pendulum()
+SAVEATS = {
+    "t1": lambda x: diffrax.SaveAt(t1=True),
+    "t0, ts, t1": lambda x: diffrax.SaveAt(t0=True, t1=True, ts=jnp.linspace(0.0, 0.9, 7) * x),
+    "ts, fn": lambda x: diffrax.SaveAt(ts=jnp.array([0.3, 0.31, 0.8]) * x, fn=lambda t, y, args: {"e": y[0] * args}),
+}
+
+
+def loss(x, saveat, solver, dt0, t0=0.1, t1=1.0):
+    """Of the angle of the start, gravity, both times and a factor on the times saved at."""
+    angle, gravity, start, end, factor = x
+    system = dae_jax.ConstrainedSystem(lambda t, q, v, g: jnp.stack([0 * g, g]), SCENE.system.constraint)
+    y0 = (jnp.stack([jnp.sin(angle), jnp.cos(angle)]), jnp.stack([jnp.cos(angle), -jnp.sin(angle)]))
+    sol = dae_jax.daesolve(
+        system, solver, start * t0, end * t1, dt0, y0, gravity, saveat=SAVEATS[saveat](factor), max_steps=200, throw=False
+    )  # fmt: skip
+    leaves = [jnp.sum(jnp.sin(3 * leaf)) for leaf in jax.tree.leaves((sol.ys, sol.ts, sol.t1))]
+    return sum(leaves)
+
+
+@pytest.mark.parametrize("dt0", [None, 0.05, -0.05], ids=["adaptive", "fixed", "backwards"])
+@pytest.mark.parametrize("saveat", SAVEATS)
+@pytest.mark.parametrize(
+    "solver",
+    [diffrax.Tsit5(), dae_jax.OrthogonalProjection(dae_jax.DOP853()), dae_jax.TangentSpace(diffrax.Tsit5())],
+    ids=lambda s: type(s).__name__,
+)
+def test_equals_diffrax_with_respect_to_everything(solver, saveat, dt0):
+    if dt0 is not None and dt0 < 0 and saveat != "t1":
+        pytest.skip("the times to save at are those of a solve forwards")
+    times = (1.0, 0.1) if dt0 is not None and dt0 < 0 else (0.0, 1.0)
+    x = jnp.array([1.2, 9.81, 1.0, 1.0, 1.0])
+    gradient = jax.grad(lambda x: loss(x, saveat, solver, dt0, *times))
+    taped = gradient(x)
+    with dae_jax.configure(one_kernel=False):
+        expected = gradient(x)
+    assert np.abs(expected).max() > 0.1
+    # For steps of sizes of their own, diffrax lets the start of the interval move all of them; so does the tape.
+    np.testing.assert_allclose(taped, expected, rtol=1e-8, atol=1e-9)
+
+
+def test_is_used_where_it_should_be():
+    solve = dae_jax.program.Solve(
+        dae_jax.Differentiation(), dae_jax.DOP853(), diffrax.SaveAt(t1=True), diffrax.PIDController(1e-6, 1e-6),
+        diffrax.RecursiveCheckpointAdjoint(), None, 1000, diffrax.NoProgressMeter(),
+    )  # fmt: skip
+    assert can_be_taped(solve, 4)
+    assert not can_be_taped(solve, LARGEST_TAPE // 1000)
+    for name, value in {
+        "saveat": diffrax.SaveAt(dense=True),
+        "solver": diffrax.Kvaerno5(),
+        "max_steps": None,
+        "event": diffrax.Event(lambda t, y, args, **kwargs: y[0]),
+    }.items():
+        fields = {k: getattr(solve, k) for k in solve.__dataclass_fields__} | {name: value}
+        assert not can_be_taped(type(solve)(**fields), 4)
+
+
+def test_gradient_of_a_long_chain_is_right():
+    scene = chain(20)
+
+    def end(gravity):
+        system = dae_jax.ConstrainedSystem(
+            lambda t, q, v, g: jnp.tile(jnp.stack([0 * g, g]), 20), scene.system.constraint
+        )
+        sol = dae_jax.daesolve(system, dae_jax.OrthogonalProjection(diffrax.Tsit5()), 0.0, 0.2, 0.02, scene.y0, gravity)
+        return jnp.sum(sol.ys[0] ** 2)
+
+    h = 1e-4
+    central = (end(9.81 + h) - end(9.81 - h)) / (2 * h)
+    np.testing.assert_allclose(jax.grad(end)(9.81), central, rtol=1e-7)
