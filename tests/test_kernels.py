@@ -224,6 +224,25 @@ class TestOneKernel:
         xs = jnp.stack([X, 2 * X])
         close(jax.jit(jax.vmap(one_kernel(loop, derivative)))(xs), jax.vmap(loop)(xs))
 
+    @pytest.mark.parametrize("derivative", ["forward", "reverse"])
+    def test_vmap_of_what_would_scatter_is_one_kernel_too(self, derivative):
+        """Lanes that write at places of their own cannot run in step in a kernel, but one after another."""
+
+        def writes(x):
+            i = jnp.argmax(x > 0.5)
+            return jax.lax.fori_loop(0, 3, lambda k, y: y.at[(i + k) % 4].set(x[k] + y[0]), jnp.zeros(4))
+
+        xs = jnp.stack([X, 2 * X, 0.1 * X])
+        fused = jax.vmap(one_kernel(writes, derivative))
+        close(jax.jit(fused)(xs), jax.vmap(writes)(xs))
+        assert is_marked(fused, xs)
+        nested = jax.vmap(jax.vmap(one_kernel(writes, derivative)))
+        twice = jnp.stack([xs, 3 * xs])
+        close(jax.jit(nested)(twice), jax.vmap(jax.vmap(writes))(twice))
+
+    def test_unused_arguments_do_no_harm(self):
+        close(jax.jit(one_kernel(lambda x, y, z: loop(y), "forward"))(X, 2 * X, V), loop(2 * X))
+
     def test_forward_derivatives(self):
         fused = one_kernel(loop, "forward")
         close(jax.jit(jax.jacfwd(fused))(X), jax.jacfwd(loop)(X))

@@ -3,10 +3,13 @@
 import jax
 import jax.numpy as jnp
 import jax.test_util
+import lineax
 import numpy as np
+import optimistix
 import pytest
 
-from dae_jax.linalg import elimination, newton, rms_norm, semidefinite_solve, solve
+from dae_jax.kernels import hindrances
+from dae_jax.linalg import SmallCholesky, SmallLU, elimination, newton, rms_norm, semidefinite_solve, solve
 from dae_jax.linalg.semidefinite import LOOPED, UNROLLED
 
 
@@ -287,3 +290,48 @@ class TestRmsNorm:
         x = {"a": jnp.array([3.0, 4.0]), "b": jnp.zeros((2, 1))}
         np.testing.assert_allclose(rms_norm(x), 2.5)
         assert (jax.grad(lambda x: rms_norm(x))(jnp.zeros(3)) == 0).all()
+
+
+def through_lineax(solver, tags=()):
+    return lambda a, b: lineax.linear_solve(lineax.MatrixLinearOperator(a, tags), b, solver).value
+
+
+class TestLineaxSolvers:
+    A = definite(4) + np.triu(np.ones((4, 4)), 1)
+
+    def test_general(self):
+        b = right(4)
+        np.testing.assert_allclose(
+            through_lineax(SmallLU())(jnp.array(self.A), jnp.array(b)), np.linalg.solve(self.A, b)
+        )
+
+    def test_definite(self):
+        S, b = definite(5), right(5)
+        solve_with = through_lineax(SmallCholesky(), lineax.positive_semidefinite_tag)
+        np.testing.assert_allclose(solve_with(jnp.array(S), jnp.array(b)), np.linalg.solve(S, b))
+        with pytest.raises(ValueError, match="positive definite operator"):
+            through_lineax(SmallCholesky())(jnp.array(S), jnp.array(b))
+
+    def test_derivatives_and_vmap(self):
+        solve_with = through_lineax(SmallLU())
+        jax.test_util.check_grads(solve_with, (jnp.array(self.A), jnp.array(right(4))), order=1, rtol=1e-6)
+        bs = right(3, 4)
+        together = jax.vmap(lambda b: solve_with(jnp.array(self.A), b))(jnp.array(bs))
+        np.testing.assert_allclose(together, np.linalg.solve(self.A, bs.T).T)
+
+    def test_pytrees(self):
+        operator = lineax.PyTreeLinearOperator(
+            {"r": {"x": jnp.eye(2) * 3, "y": jnp.ones((2,))}, "s": {"x": jnp.ones(2), "y": jnp.array(5.0)}},
+            {"r": jax.ShapeDtypeStruct((2,), jnp.float64), "s": jax.ShapeDtypeStruct((), jnp.float64)},
+        )
+        b = {"r": jnp.array([1.0, 2.0]), "s": jnp.array(3.0)}
+        found = lineax.linear_solve(operator, b, SmallLU()).value
+        expected = lineax.linear_solve(operator, b, lineax.LU()).value
+        jax.tree.map(lambda a, c: np.testing.assert_allclose(a, c, rtol=1e-12), found, expected)
+
+    def test_serves_optimistix_without_a_library_call(self):
+        residual = lambda y, args: jnp.stack([y[0] ** 2 + y[1] - 3, y[0] - y[1] ** 2 + 1])
+        newton_method = optimistix.Newton(1e-12, 1e-12, linear_solver=SmallLU())
+        find = lambda y: optimistix.root_find(residual, newton_method, y, throw=False).value
+        np.testing.assert_allclose(residual(find(jnp.array([1.0, 1.0])), None), 0, atol=1e-12)
+        assert "lu" not in hindrances(jax.make_jaxpr(find)(jnp.array([1.0, 1.0])))

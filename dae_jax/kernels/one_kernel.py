@@ -218,7 +218,7 @@ def _forward(fn: Callable[..., Any]) -> Callable[..., Any]:
     return solve
 
 
-def _fused(fn: Callable[..., Any]) -> Callable[..., Any]:
+def _fused(fn: Callable[..., Any], batched: bool = False) -> Callable[..., Any]:
     def traced(*args: Any) -> Any:
         leaves, treedef = jax.tree.flatten(args)
         structure: list[Any] = []
@@ -230,21 +230,11 @@ def _fused(fn: Callable[..., Any]) -> Callable[..., Any]:
 
         @custom_vmap
         def call(*xs: Any) -> list[Any]:
-            return _compile(flat, xs)
+            return _compile(flat, xs, batched)
 
         @call.def_vmap
-        def _(axis_size: int, batched: list[bool], *xs: Any) -> Any:
-            axes = [0 if b else None for b in batched]
-            varies: list[bool] = []
-
-            def lane(*ys: Any) -> list[Any]:
-                out = flat(*ys)
-                # `jacfwd` asks that a value which does not depend on the direction stays unbatched.
-                varies[:] = [getattr(o, "batch_dim", None) is not None for o in out]
-                return out
-
-            out = _compile(jax.vmap(lane, in_axes=axes, axis_size=axis_size), xs, batched=True)
-            return [o if v else o[0] for o, v in zip(out, varies, strict=True)], varies
+        def _(axis_size: int, is_batched: list[bool], *xs: Any) -> Any:
+            return _batch(flat, axis_size, is_batched, xs)
 
         out = call(*leaves)
         return jax.tree.unflatten(structure[0], out)
@@ -252,12 +242,51 @@ def _fused(fn: Callable[..., Any]) -> Callable[..., Any]:
     return traced
 
 
-def _compile(fn: Callable[..., Any], args: Any, batched: bool = False) -> Any:
+def _batch(flat: Callable[..., list[Any]], size: int, is_batched: list[bool], xs: Any) -> tuple[list[Any], list[bool]]:
+    """All lanes in step, where that can be one kernel or where a lane alone cannot; else one after another in one kernel,
+    where none waits for another (10,000 double pendulums: 0.6 s in place of 8).
+    """
+    axes = [0 if b else None for b in is_batched]
+    varies: list[bool] = []
+
+    def lane(*ys: Any) -> list[Any]:
+        out = flat(*ys)
+        # `jacfwd` asks that a value which does not depend on the direction stays unbatched.
+        varies[:] = [getattr(o, "batch_dim", None) is not None for o in out]
+        return out
+
+    together = jax.vmap(lane, in_axes=axes, axis_size=size)
+    in_step = jax.make_jaxpr(without_checks(together))(*xs)
+    kept = list(varies)
+    one = [jax.ShapeDtypeStruct(x.shape[1:] if b else x.shape, x.dtype) for x, b in zip(xs, is_batched, strict=True)]
+    if _qualifies(in_step, batched=True) or not _qualifies(jax.make_jaxpr(without_checks(flat))(*one)):
+        out = _fused(together, batched=True)(*xs)
+        return [o if v else o[0] for o, v in zip(out, kept, strict=True)], kept
+
+    def in_turn(*ys: Any) -> list[Any]:
+        lanes = tuple(y for y, b in zip(ys, is_batched, strict=True) if b)
+
+        def one_lane(lane: Any) -> list[Any]:
+            of_lane = iter(lane)
+            return flat(*(next(of_lane) if b else y for y, b in zip(ys, is_batched, strict=True)))
+
+        return jax.lax.map(one_lane, lanes)
+
+    out = _fused(in_turn)(*xs)
+    return out, [True] * len(out)
+
+
+def _compile(fn: Callable[..., Any], args: Any, batched: bool) -> Any:
     jaxpr = jax.make_jaxpr(without_checks(fn))(*args)
-    call = jax.jit(jaxpr_as_fun(jaxpr))
-    # Of the scatters only the update of one row becomes a copy, and that for certain only where nothing is batched.
-    if hindrances(jaxpr) or (batched and any(e.primitive.name.startswith("scatter") for e in equations(jaxpr))):
-        return call(*args)
+    if not _qualifies(jaxpr, batched):
+        return jax.jit(jaxpr_as_fun(jaxpr))(*args)
     # The kernel has nothing but a call in it: XLA aborts where one of its parameters is not the operand of anything.
     with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
         return jax.jit(lambda *xs: subroutine(jaxpr_as_fun(jaxpr))(*xs))(*args)
+
+
+def _qualifies(jaxpr: ClosedJaxpr, batched: bool = False) -> bool:
+    # Of the scatters only the update of one row becomes a copy, and that for certain only where nothing is batched.
+    return not hindrances(jaxpr) and not (
+        batched and any(eqn.primitive.name.startswith("scatter") for eqn in equations(jaxpr))
+    )

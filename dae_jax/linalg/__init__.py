@@ -2,6 +2,7 @@
 
 from .dense import solve as solve
 from .elimination import Elimination as Elimination, elimination as elimination, take as take
+from .lineax_solvers import SmallCholesky as SmallCholesky, SmallLU as SmallLU
 from .newton import (
     fixed_point as fixed_point,
     implicit_root as implicit_root,

@@ -1,0 +1,102 @@
+"""The plan says what was found, what is left out, and whether the loop is one kernel."""
+
+import functools
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dae_jax
+from dae_jax.scenes import SCENES, chain
+
+
+PROJECTED = dae_jax.OrthogonalProjection(dae_jax.DOP853())
+
+
+def plan(scene, solver=PROJECTED, **options):
+    return dae_jax.explain(scene.system, solver, 0.0, scene.y0, scene.args, **options)
+
+
+@pytest.mark.parametrize("name", [name for name in SCENES if name != "four-bar-redundant"])
+def test_every_scene_is_one_kernel(name):
+    found = plan(SCENES[name]())
+    assert found.one_kernel, found.hindrances
+    assert found.hindrances == ()
+
+
+def test_names_the_primitive_that_prevents_it():
+    found = plan(SCENES["four-bar-redundant"]())
+    assert not found.one_kernel
+    assert found.hindrances == ("eigh",)
+    assert (found.constraints, found.independent) == (4, 3)
+    assert "no: eigh" in str(found)
+
+
+def test_switched_off():
+    with dae_jax.configure(one_kernel=False):
+        found = plan(SCENES["pendulum"]())
+    assert not found.one_kernel
+    assert found.hindrances == ()
+
+
+def test_says_what_a_scene_has_and_has_not():
+    unit = plan(SCENES["double-pendulum"]())
+    assert unit.mass == "unit masses"
+    assert "mass solve" in unit.left_out
+    assert not unit.constraints_depend_on_time
+    moving = plan(SCENES["moving-pivot-pendulum"]())
+    assert moving.constraints_depend_on_time
+    assert "time derivatives of the constraints" not in moving.left_out
+    dense = plan(SCENES["pendulum"](), saveat=diffrax.SaveAt(dense=True))
+    assert "dense output" not in dense.left_out
+
+
+def test_a_long_chain_is_sparse():
+    found = plan(chain(64), dae_jax.DOP853())
+    assert found.colours == 4
+    assert found.nonzeros == 4 * 64 - 2
+    assert found.linear_solver.startswith("sparse elimination")
+    assert found.one_kernel
+
+
+@pytest.mark.parametrize("make", [functools.partial(chain, 24)])
+def test_sparse_and_dense_give_the_same_numbers(make, monkeypatch):
+    scene = make()
+    solve = lambda: dae_jax.daesolve(
+        scene.system, PROJECTED, 0.0, 0.5, None, scene.y0, formulation=dae_jax.Baumgarte(1.0, 2.0)
+    )
+    sparse = solve()
+    monkeypatch.setattr("dae_jax.constraints.SPARSE_FROM", 1000)
+    system = dae_jax.ConstrainedSystem(lambda *a: scene.system.force(*a), scene.system.constraint)
+    dense = dae_jax.daesolve(system, PROJECTED, 0.0, 0.5, None, scene.y0, formulation=dae_jax.Baumgarte(1.0, 2.0))
+    for a, b in zip(sparse.ys, dense.ys, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-9)
+    assert dae_jax.drift(scene.system, sparse).position.max() < 1e-13
+
+
+def test_diagonal_masses_keep_a_chain_sparse():
+    scene = chain(12)
+    masses = np.linspace(1, 2, 24)
+    system = dae_jax.ConstrainedSystem(scene.system.force, scene.system.constraint, mass=masses)
+    full = dae_jax.ConstrainedSystem(scene.system.force, scene.system.constraint, mass=np.diag(masses))
+    assert dae_jax.explain(system, PROJECTED, 0.0, scene.y0).colours == 4
+    assert dae_jax.explain(full, PROJECTED, 0.0, scene.y0).colours is None
+    ends = [dae_jax.daesolve(s, PROJECTED, 0.0, 0.3, None, scene.y0).ys for s in (system, full)]
+    for a, b in zip(*ends, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-9)
+
+
+def test_the_plan_is_found_inside_jit_too():
+    scene = SCENES["pendulum"]()
+    plans = []
+
+    def solve(gravity):
+        system = dae_jax.ConstrainedSystem(lambda t, q, v, g: jnp.stack([0 * g, g]), scene.system.constraint)
+        plans.append(dae_jax.explain(system, PROJECTED, 0.0, scene.y0, gravity))
+        return gravity
+
+    jax.jit(solve)(9.81)
+    assert plans[0].independent is None
+    assert plans[0].one_kernel
