@@ -259,9 +259,6 @@ def _batch(flat: Callable[..., list[Any]], size: int, is_batched: list[bool], xs
     in_step = jax.make_jaxpr(without_checks(together))(*xs)
     kept = list(varies)
     one = [jax.ShapeDtypeStruct(x.shape[1:] if b else x.shape, x.dtype) for x, b in zip(xs, is_batched, strict=True)]
-    if _qualifies(in_step, batched=True) or not _qualifies(jax.make_jaxpr(without_checks(flat))(*one)):
-        out = _fused(together, batched=True)(*xs)
-        return [o if v else o[0] for o, v in zip(out, kept, strict=True)], kept
 
     def in_turn(*ys: Any) -> list[Any]:
         lanes = tuple(y for y, b in zip(ys, is_batched, strict=True) if b)
@@ -272,8 +269,9 @@ def _batch(flat: Callable[..., list[Any]], size: int, is_batched: list[bool], xs
 
         return jax.lax.map(one_lane, lanes)
 
-    out = _fused(in_turn)(*xs)
-    return out, [True] * len(out)
+    together_is_best = _qualifies(in_step, batched=True) or not _qualifies(jax.make_jaxpr(without_checks(flat))(*one))
+    out = _fused(together, batched=True)(*xs) if together_is_best else _fused(in_turn)(*xs)
+    return [o if v else o[0] for o, v in zip(out, kept, strict=True)], kept
 
 
 def _compile(fn: Callable[..., Any], args: Any, batched: bool) -> Any:
