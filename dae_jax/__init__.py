@@ -1,5 +1,6 @@
 """Differentiable solvers for differential-algebraic equations in JAX."""
 
+from .analyse import Structure as Structure, analyse as analyse
 from .diagnostics import Drift as Drift, drift as drift, energy as energy, multipliers as multipliers
 from .explain import Plan as Plan, explain as explain
 from .formulations import (

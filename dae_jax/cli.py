@@ -16,6 +16,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--version", action="version", version=importlib.metadata.version("dae_jax"))
     commands = parser.add_subparsers(dest="command", required=True)
     _add_compare(commands)
+    _add_analyse(commands)
     commands.add_parser(
         "bench", help="run the benchmarks of a source checkout; `bench --help` lists them", add_help=False
     )
@@ -61,6 +62,37 @@ def _compare(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> 
     folder = arguments.out or Path(f"compare-{arguments.scene}")
     for path in write(scene, rows, solutions, arguments.rtol, folder):
         print(path)
+    return 0
+
+
+def _add_analyse(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser("analyse", help="print index, offsets, degrees of freedom and hidden constraints")
+    parser.add_argument(
+        "scene", metavar="SCENE | MODULE:NAME", help="a ready scene, or a name in a module that is a Scene or makes one"
+    )
+    parser.set_defaults(run=_analyse)
+
+
+def _analyse(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> int:
+    from .analyse import analyse
+    from .scenes import SCENES, Scene
+
+    module, colon, name = arguments.scene.partition(":")
+    if not colon and module not in SCENES:
+        parser.error(f"unknown scene {module!r}; choose from {', '.join(SCENES)}, or give MODULE:NAME")
+    try:
+        if colon:
+            sys.path.insert(0, "")
+        found = getattr(importlib.import_module(module), name) if colon else SCENES[module]
+    except (ImportError, AttributeError) as failure:
+        parser.error(f"{arguments.scene!r} cannot be imported: {failure}")
+    scene = found() if callable(found) else found
+    if not isinstance(scene, Scene):
+        parser.error(f"{arguments.scene!r} is no dae_jax.scenes.Scene, but a {type(scene).__name__}")
+    try:
+        print(analyse(scene.system, 0.0, scene.y0, scene.args))
+    except ValueError as refusal:
+        parser.error(str(refusal))
     return 0
 
 

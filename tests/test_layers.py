@@ -14,7 +14,7 @@ LAYERS = (
     {"kernels", "linalg", "structure"},
     {"constraints", "initialise", "normals", "residual", "systems"},
     {"formulations", "solvers"},
-    {"checks", "diagnostics", "explain", "program", "solution", "solve", "tape"},
+    {"analyse", "checks", "diagnostics", "explain", "program", "solution", "solve", "tape"},
     {"compare", "plotting", "scenes", "sweep", "tune"},
     {"__main__", "cli"},
 )

@@ -1,0 +1,201 @@
+"""Structural analysis: the index of a system, its hidden constraints and its degrees of freedom, before it is solved."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .residual import ResidualForm
+from .structure import (
+    Block,
+    StructurallySingular,
+    block_triangular,
+    dependence,
+    jacobian_pattern,
+    pantelides,
+    sigma_method,
+    signature,
+)
+from .systems import System
+
+
+# A system of more variables is summed up in words; its incidence matrix would not fit a page.
+DRAWN = 60
+
+
+@dataclasses.dataclass(frozen=True)
+class Structure:
+    """What structural analysis finds in 0 = F(t, y, ẏ); `print` it.
+
+    - `equations`, `variables`: names.
+    - `signature`: for each equation, its variables with the highest derivative that occurs, 0 or 1.
+    - `index`: the structural index, an upper bound of the differential index where `regular`.
+    - `degrees_of_freedom`: how many initial values can be chosen.
+    - `equation_offsets`, `variable_offsets`: c and d; equation i is to be differentiated cᵢ times, and then determines
+      derivatives up to the order dⱼ of variable j (Pryce's Σ-method).
+    - `pantelides_offsets`: how often Pantelides' algorithm differentiates each equation; the same where its result is
+      the canonical one.
+    - `transversal`: the variable that each equation is paired with.
+    - `blocks`: the block triangular form of the differentiated system, in the order of solution.
+    - `regular`: whether the system Jacobian ∂Fᵢ/∂xⱼ^(dⱼ−cᵢ) is nonsingular near the given state. If not, the structure
+      misleads and the index may be higher.
+    - `nonzeros`, `bandwidth`: of the incidence matrix, as the equations and variables are ordered.
+
+    Source: J. D. Pryce, A simple structural analysis method for DAEs, BIT 41 (2001); C. C. Pantelides, SIAM J. Sci.
+    Stat. Comput. 9 (1988).
+    """
+
+    form: ResidualForm = dataclasses.field(repr=False)
+    signature: tuple[dict[int, int], ...] = dataclasses.field(repr=False)
+    index: int
+    degrees_of_freedom: int
+    equation_offsets: tuple[int, ...]
+    variable_offsets: tuple[int, ...]
+    pantelides_offsets: tuple[int, ...]
+    transversal: tuple[int, ...]
+    blocks: tuple[Block, ...] = dataclasses.field(repr=False)
+    regular: bool
+
+    @property
+    def equations(self) -> tuple[str, ...]:
+        """A name for each equation."""
+        return self.form.equations
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """A name for each variable."""
+        return self.form.variables
+
+    @property
+    def nonzeros(self) -> int:
+        """How many variables occur in the equations, in all."""
+        return sum(map(len, self.signature))
+
+    @property
+    def bandwidth(self) -> int:
+        """The greatest distance of an entry from the diagonal."""
+        return max((abs(i - j) for i, row in enumerate(self.signature) for j in row), default=0)
+
+    def derivative(self, times: int) -> Callable[[Any, Float[Array, "orders n"]], Float[Array, " n"]]:
+        """dᵏF/dtᵏ for k = `times`, as a function of t and of (y, ẏ, …, y^(k+1)), one below the other."""
+
+        def along(t: Any, derivatives: Float[Array, "orders n"]) -> Float[Array, " n"]:
+            def curve(s: Any) -> Float[Array, " n"]:
+                # Taylor's polynomial in nested form: powers of s = 0 have no derivative in JAX.
+                value = derivatives[-1]
+                for k in reversed(range(1, len(derivatives))):
+                    value = derivatives[k - 1] + s / k * value
+                return value
+
+            residual = lambda s: self.form.residual(t + s, *jax.jvp(curve, (s,), (jnp.ones_like(s),)))
+            for _ in range(times):
+                residual = jax.jacfwd(residual)
+            return residual(jnp.zeros((), derivatives.dtype))
+
+        return along
+
+    def hidden_constraints(self) -> tuple[tuple[str, int], ...]:
+        """Which equations, differentiated how often, restrict the initial values: those of lower order than cᵢ."""
+        return tuple((self.equations[i], k) for i, c in enumerate(self.equation_offsets) for k in range(c))
+
+    def __str__(self) -> str:
+        lines = [
+            f"{len(self.equations)} equations, index {self.index}, {self.degrees_of_freedom} degrees of freedom, "
+            f"{len(self.blocks)} blocks, {self.nonzeros} nonzeros, bandwidth {self.bandwidth}",
+        ]
+        if not self.regular:
+            lines.append(
+                "The system Jacobian is singular near the given state although its structure is not: the index may be "
+                "higher. Replace an equation by a combination of equations in which the cancelling terms are gone, or "
+                "introduce the cancelling expression as a variable."
+            )
+        if len(self.equations) > DRAWN:
+            return "\n".join(lines)
+        width = max(map(len, self.equations))
+        lines += ["", f"{'':{width}}  c  variables in order; ' marks a derivative, [ ] the pairing"]
+        for i, row in enumerate(self.signature):
+            cells = [self._cell(row, i, j) for j in range(len(self.variables))]
+            lines.append(f"{self.equations[i]:{width}}  {self.equation_offsets[i]}  {''.join(cells)}")
+        lines += ["", "variable: d"]
+        lines += [f"  {name}: {d}" for name, d in zip(self.variables, self.variable_offsets, strict=True)]
+        hidden = [
+            f"  0 = {name}" + (f", differentiated {k} times" if k else "") for name, k in self.hidden_constraints()
+        ]
+        free = [
+            f"consistent are the values, with derivatives of orders below d, that satisfy{'' if hidden else ' nothing more'}"
+        ]
+        return "\n".join([*lines, "", *free, *hidden])
+
+    def _cell(self, row: dict[int, int], i: int, j: int) -> str:
+        if j not in row:
+            return " ·  "
+        mark = "x'" if row[j] else "x"
+        return (f"[{mark}]" if self.transversal[i] == j else f" {mark}").ljust(4)
+
+
+def analyse(system: System, t0: Any, y0: Any, args: Any = None) -> Structure:
+    """The structure of a system: index, offsets, degrees of freedom, hidden constraints.
+
+    A `ConstrainedSystem` is read as its index-3 equations of first order in (q, v, λ). Which equation depends on which
+    variable is read from the jaxpr, for any t; `y0` gives shapes, and the place where the Jacobian is looked at.
+
+    Errors: `ValueError` for a structurally singular system, naming the equations that have too few variables and the
+    variables that have too few equations.
+    """
+    y0 = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
+    form = ResidualForm.of(system, t0, y0, args)
+    y = form.encode(y0)
+    t = jnp.asarray(t0, y.dtype)
+    _, on_y, on_rate = dependence(form.residual, t, y, y)
+    found = signature(on_y, on_rate)
+    try:
+        sigma = sigma_method(found)
+    except StructurallySingular as singular:
+        raise ValueError(_singular(form, singular)) from None
+    pattern = jacobian_pattern(found, sigma.equation_offsets, sigma.variable_offsets)
+    return Structure(
+        form,
+        tuple(found),
+        sigma.index,
+        sigma.degrees_of_freedom,
+        sigma.equation_offsets,
+        sigma.variable_offsets,
+        pantelides(found).equation_offsets,
+        sigma.transversal,
+        tuple(block_triangular(pattern, sigma.transversal)),
+        _regular(form, t, y, pattern, found),
+    )
+
+
+def _singular(form: ResidualForm, singular: StructurallySingular) -> str:
+    parts = []
+    if singular.equations:
+        names = ", ".join(form.equations[i] for i in singular.equations)
+        parts.append(f"the equations {names} have too few variables between them")
+    if singular.variables:
+        names = ", ".join(form.variables[j] for j in singular.variables)
+        parts.append(f"the variables {names} have too few equations between them")
+    return f"The system is structurally singular: {'; '.join(parts)}."
+
+
+def _regular(form: ResidualForm, t: Any, y: Any, pattern: list[list[int]], found: list[dict[int, int]]) -> bool:
+    """Whether the system Jacobian has full rank at the state, for generic derivatives and multipliers."""
+    rng = np.random.default_rng(0)
+    wanted = np.zeros((2, len(y), len(y)), bool)
+    for i, variables in enumerate(pattern):
+        for j in variables:
+            wanted[found[i][j], i, j] = True
+    for _ in range(3):
+        at = y.at[form.layout.size :].set(rng.normal(size=form.extra))
+        by_y, by_rate = jax.jacfwd(form.residual, (1, 2))(t, at, jnp.asarray(rng.normal(size=len(y)), y.dtype))
+        matrix = np.where(wanted[0], by_y, 0) + np.where(wanted[1], by_rate, 0)
+        rows = np.abs(matrix).max(1, keepdims=True)
+        if (rows > 0).all() and np.isfinite(matrix).all():
+            values = np.linalg.svd(matrix / rows, compute_uv=False)
+            if values[-1] > 100 * len(y) * np.finfo(matrix.dtype).eps * values[0]:
+                return True
+    return False

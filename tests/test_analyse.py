@@ -1,0 +1,127 @@
+"""Index, offsets and degrees of freedom against the published ones, and verdicts on systems that mislead."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dae_jax
+from dae_jax.cli import main
+from dae_jax.scenes import SCENES, chain
+
+
+def of_scene(name):
+    scene = SCENES[name]()
+    return dae_jax.analyse(scene.system, 0.0, scene.y0, scene.args)
+
+
+def test_pendulum_has_the_published_offsets():
+    found = of_scene("pendulum")
+    assert found.equation_offsets == (1, 1, 0, 0, 2)
+    assert found.pantelides_offsets == found.equation_offsets
+    assert (found.index, found.degrees_of_freedom, found.regular) == (3, 2, True)
+    assert found.variables == ("q[0]", "q[1]", "v[0]", "v[1]", "multiplier[0]")
+
+
+@pytest.mark.parametrize(
+    ("name", "index", "freedom"),
+    [
+        ("double-pendulum", 3, 4),
+        ("spherical-pendulum", 3, 4),
+        ("moving-pivot-pendulum", 3, 2),
+        ("four-bar", 3, 2),
+        ("slider-crank", 3, 2),
+        ("bead-on-torus", 3, 4),
+        ("knife-edge", 2, 5),
+    ],
+)
+def test_scenes(name, index, freedom):
+    found = of_scene(name)
+    assert (found.index, found.degrees_of_freedom, found.regular) == (index, freedom, True)
+
+
+def hessenberg(depth):
+    """x1' = x2, …, x_{k-1}' = x_k, 0 = x1 − sin t: index k."""
+
+    def residual(t, y, yd, args):
+        return jnp.concatenate([yd[:-1] - y[1:], jnp.stack([y[0] - jnp.sin(t)])])
+
+    return dae_jax.ImplicitDAE(residual)
+
+
+@pytest.mark.parametrize("index", [1, 2, 3, 4, 5])
+def test_a_chain_of_integrators_has_any_index(index):
+    found = dae_jax.analyse(hessenberg(index), 0.0, jnp.zeros(index))
+    assert found.index == index
+    assert found.degrees_of_freedom == 0
+    assert found.equation_offsets[-1] == index - 1
+
+
+def test_semi_explicit_index_1_and_2():
+    first = dae_jax.SemiExplicitDAE(lambda t, x, z, a: -x + z, lambda t, x, z, a: z**3 + x - 1)
+    second = dae_jax.SemiExplicitDAE(lambda t, x, z, a: -x + z, lambda t, x, z, a: x - jnp.sin(t))
+    state = (jnp.ones(1), jnp.zeros(1))
+    assert (dae_jax.analyse(first, 0.0, state).index, dae_jax.analyse(second, 0.0, state).index) == (1, 2)
+    # z³ has no slope at z = 0, where the state is: the Jacobian is singular there and says so.
+    assert not dae_jax.analyse(first, 0.0, state).regular
+    assert dae_jax.analyse(first, 0.0, (jnp.ones(1), jnp.ones(1))).regular
+
+
+def test_an_ode_has_index_0():
+    found = dae_jax.analyse(dae_jax.ImplicitDAE(lambda t, y, yd, a: yd + y), 0.0, jnp.ones(3))
+    assert (found.index, found.degrees_of_freedom, len(found.blocks)) == (0, 3, 3)
+
+
+def test_a_zero_at_the_start_hides_no_dependence():
+    system = dae_jax.ImplicitDAE(lambda t, y, yd, a: jnp.stack([yd[0] - t * y[1], y[1] - y[0] * t]))
+    assert dae_jax.analyse(system, 0.0, jnp.zeros(2)).signature == ({0: 1, 1: 0}, {1: 0, 0: 0})
+
+
+def test_a_singular_jacobian_behind_a_regular_structure_is_found():
+    """The sums cancel: the difference of the equations has no derivative, so that the index is 1 and not 0."""
+    system = dae_jax.ImplicitDAE(lambda t, y, yd, a: jnp.stack([yd[0] + yd[1] + y[0], yd[0] + yd[1] + y[1]]))
+    found = dae_jax.analyse(system, 0.0, jnp.ones(2))
+    assert not found.regular
+    assert "Replace an equation by a combination" in str(found)
+
+
+def test_redundant_constraints_are_singular():
+    assert not of_scene("four-bar-redundant").regular
+
+
+def test_structurally_singular_systems_are_named():
+    system = dae_jax.ImplicitDAE(lambda t, y, yd, a: {"rate": yd["p"] + y["p"], "level": y["p"] - 1})
+    with pytest.raises(ValueError, match=r"residual\['level'\].*y\['q'\]"):
+        dae_jax.analyse(system, 0.0, {"p": 1.0, "q": 2.0})
+    with pytest.raises(ValueError, match="1 equations for 2 unknowns"):
+        dae_jax.analyse(dae_jax.ImplicitDAE(lambda t, y, yd, a: y[:1]), 0.0, jnp.ones(2))
+
+
+@pytest.mark.parametrize("times", [0, 1, 2, 3])
+def test_differentiated_equations_along_a_solution_vanish(times):
+    """Along x1 = sin t, every derivative of the chain of integrators is 0, and off it is not."""
+    found = dae_jax.analyse(hessenberg(3), 0.0, jnp.zeros(3))
+    t = 0.7
+    sine = lambda k: np.sin(t + k * np.pi / 2)
+    derivatives = jnp.array([[sine(j + k) for j in range(3)] for k in range(times + 2)])
+    np.testing.assert_allclose(found.derivative(times)(t, derivatives), 0, atol=1e-14)
+    off = derivatives.at[times, 0].add(1.0)
+    np.testing.assert_allclose(found.derivative(times)(t, off)[-1], 1, atol=1e-14)
+
+
+def test_a_system_of_200_equations():
+    scene = chain(40)
+    found = dae_jax.analyse(scene.system, 0.0, scene.y0)
+    assert len(found.equations) == 200
+    assert (found.index, found.degrees_of_freedom, found.regular) == (3, 80, True)
+    assert "·" not in str(found)  # too large to draw
+
+
+def test_command(capsys):
+    assert main(["analyse", "pendulum"]) == 0
+    assert "index 3, 2 degrees of freedom" in capsys.readouterr().out
+    assert main(["analyse", "dae_jax.scenes:knife_edge"]) == 0
+    assert "index 2" in capsys.readouterr().out
+    for wrong in ("pendulums", "dae_jax.scenes:nothing", "math:pi"):
+        with pytest.raises(SystemExit):
+            main(["analyse", wrong])
+    assert "math:pi' is no dae_jax.scenes.Scene" in capsys.readouterr().err
