@@ -1,5 +1,8 @@
 """Scalarised and one-kernel functions are the functions they were made of."""
 
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -263,3 +266,23 @@ class TestOneKernel:
         fused = one_kernel(two_results, "reverse")
         grad = jax.grad(lambda x: jnp.sum(fused({"x": x, "n": jnp.array(3)})["y"]))(X)
         close(grad, jax.grad(lambda x: jnp.sum(loop(x)))(X))
+
+
+class TestProcessWide:
+    def test_too_late(self):
+        jnp.zeros(1).block_until_ready()
+        with pytest.raises(RuntimeError, match="comes too late"):
+            configure(process_wide=True)
+
+    def test_in_a_program_of_its_own(self):
+        program = (
+            "import dae_jax; dae_jax.configure(process_wide=True); import jax; from dae_jax.scenes import pendulum; "
+            "scene = pendulum(); "
+            "sol = dae_jax.daesolve(scene.system, dae_jax.OrthogonalProjection(dae_jax.DOP853()), 0.0, 1.0, None, scene.y0); "
+            "assert abs(sol.ys[0] - scene.reference([1.0])[0]).max() < 1e-4; "
+            "import os; assert 'small_while_loop' in os.environ['XLA_FLAGS']"
+        )
+        environment = {"JAX_PLATFORMS": "cpu", "PATH": "/usr/bin:/bin"}
+        command = [sys.executable, "-c", program]
+        done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+        assert done.returncode == 0, done.stderr
