@@ -19,7 +19,10 @@ from .systems import ConstrainedSystem
 def checked(system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any) -> tuple[Any, Any]:
     """`y0` and `args` as arrays, once their types and shapes are right."""
     if not isinstance(system, ConstrainedSystem):
-        raise TypeError(f"`system` must be a dae_jax.ConstrainedSystem, but is a {type(system).__name__}.")
+        raise TypeError(
+            f"`system` must be a dae_jax.ConstrainedSystem, but is a {type(system).__name__}. `dae_jax.analyse` takes other "
+            "systems; to solve them is not supported yet."
+        )
     if not isinstance(y0, tuple | list) or len(y0) != 2:
         raise ValueError(f"`y0` must be the pair (q, v) of positions and velocities, but is {_brief(y0)}.")
     q, v = y0

@@ -137,17 +137,18 @@ class MechanicalODE(ManifoldODE):
     def force(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
         """f(t, q, v)."""
         flat = self.layout.unflatten
-        return self.layout.flatten(self.system.force(t, flat(q), flat(v), self.args))
+        return self.layout.flatten(self.system.force(t, flat(q), flat(v), self.args)).astype(q.dtype)
 
     def mass(self, q: Float[Array, " n"]) -> Float[Array, "..."] | None:
         """M(q): `None`, a vector (diagonal) or a matrix."""
-        return self.system.mass_matrix(self.layout.unflatten(q), self.args)
+        mass = self.system.mass_matrix(self.layout.unflatten(q), self.args)
+        return None if mass is None else mass.astype(q.dtype)
 
     def constraint(self, t: Any, q: Float[Array, " n"]) -> Float[Array, " m"]:
         """g(t, q)."""
         if self.system.constraint is None:
             return jnp.zeros(0, q.dtype)
-        return jnp.ravel(self.system.constraint(t, self.layout.unflatten(q), self.args))
+        return jnp.ravel(self.system.constraint(t, self.layout.unflatten(q), self.args)).astype(q.dtype)
 
     def velocity_constraint(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " mp"]:
         """(ġ, h) = (G v + g_t, h(t, q, v))."""
@@ -159,7 +160,7 @@ class MechanicalODE(ManifoldODE):
     def _nonholonomic(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " p"]:
         assert self.system.nonholonomic is not None
         flat = self.layout.unflatten
-        return jnp.ravel(self.system.nonholonomic(t, flat(q), flat(v), self.args))
+        return jnp.ravel(self.system.nonholonomic(t, flat(q), flat(v), self.args)).astype(q.dtype)
 
     @staticmethod
     def _along(function: Callable[..., Any], uses_time: bool, t: Any, at: Any, direction: Any) -> Any:

@@ -94,9 +94,10 @@ def _run_on_numbers(program: Program, arrays: list[Any], inputs: Any) -> DAESolu
         with jax.ensure_compile_time_eval():
             _ranks[program] = refuse_bad_start(system, t0, y0, args)
     sol, as_expected = run(program, _ranks[program], arrays)
-    # Inside an outer `jit` the result is no number, although the inputs are.
-    if not isinstance(as_expected, jax.core.Tracer) and not as_expected:
-        _ranks[program] = refuse_bad_start(system, t0, y0, args)
+    # Inside an outer `jit` the result is no number, although the inputs are: they are looked at each time it is traced.
+    if isinstance(as_expected, jax.core.Tracer) or not as_expected:
+        with jax.ensure_compile_time_eval():
+            _ranks[program] = refuse_bad_start(system, t0, y0, args)
         sol, _ = run(program, _ranks[program], arrays)
     return sol
 

@@ -230,3 +230,31 @@ def test_one_trace_for_a_sweep():
         if alpha == 1.0:
             first = count
     assert count == first
+
+
+def test_an_inconsistent_start_is_refused_in_words_also_inside_jit_and_after_a_good_one():
+    scene = dae_jax.scenes.pendulum()
+    solve = lambda y0: dae_jax.daesolve(scene.system, dae_jax.OrthogonalProjection(diffrax.Tsit5()), 0.0, 0.1, None, y0)
+    off = (1.1 * scene.y0[0], scene.y0[1])
+    solve(scene.y0)
+    with pytest.raises(ValueError, match=r"constraint\[0\] \(g\) is off by 0.105"):
+        solve(off)
+    assert jax.jit(lambda: solve(scene.y0).ys[0])().shape == (1, 2)
+    with pytest.raises(ValueError, match=r"constraint\[0\] \(g\) is off by 0.105"):
+        jax.jit(lambda: solve(off).ys[0])()
+
+
+def test_a_force_in_float64_does_not_disturb_a_state_in_float32():
+    system = dae_jax.ConstrainedSystem(
+        lambda t, q, v, args: jnp.array([0.0, 9.81]), lambda t, q, args: (q @ q - 1.0) / 2, mass=np.ones(2)
+    )
+    y0 = (jnp.array([1, 0], jnp.float32), jnp.zeros(2, jnp.float32))
+    sol = dae_jax.daesolve(system, dae_jax.OrthogonalProjection(dae_jax.DOP853()), 0.0, 1.0, None, y0)
+    assert sol.ys[0].dtype == jnp.float32
+    exact = dae_jax.scenes.pendulum().reference(np.array([1.0]))
+    np.testing.assert_allclose(sol.ys[0], exact[0], atol=1e-4)
+
+
+def test_systems_that_cannot_be_solved_yet_are_refused():
+    with pytest.raises(TypeError, match="not supported yet"):
+        dae_jax.daesolve(dae_jax.ImplicitDAE(lambda t, y, yd, a: yd), dae_jax.DOP853(), 0.0, 1.0, None, jnp.ones(2))
