@@ -20,8 +20,15 @@ def main(argv=None):
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--quick", action="store_true", help="a smoke test: few points; this library, C and diffrax")
     parser.add_argument("--out", type=Path, default=timing.RESULTS, help="folder for data and figures")
+    parser.add_argument(
+        "--synchronous", action="store_true", help="JAX computes in the calling thread, which saves waking another"
+    )
     arguments = parser.parse_args(argv)
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    if arguments.synchronous:
+        import jax
+
+        jax.config.update("jax_cpu_enable_async_dispatch", False)
     names = [n for n in arguments.peers if not arguments.quick or n in ("dae_jax_peer", "c_limit", "plain_diffrax")]
     peers = available(names)
     verdicts = []
