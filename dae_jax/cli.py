@@ -48,8 +48,9 @@ def _compare(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> 
         parser.error(f"unknown scene {arguments.scene!r}; choose from {', '.join(SCENES)}")
     scene = SCENES[arguments.scene]()
     t1 = scene.t1 if arguments.t1 is None else arguments.t1
-    if not t1 > 0:
-        parser.error(f"--t1 must be positive, but is {t1}")
+    for option, value in (("--t1", t1), ("--rtol", arguments.rtol)):
+        if not 0 < value < float("inf"):
+            parser.error(f"{option} must be positive and finite, but is {value}")
     names = arguments.methods.split(",") if arguments.methods else None
     try:
         results = list(compare(scene, names, t1, arguments.rtol))

@@ -33,6 +33,10 @@ def test_a_method_that_does_not_apply_says_why(tmp_path, capsys):
         ["compare", "no-such-scene"],
         ["compare", "pendulum", "--methods", "magic"],
         ["compare", "pendulum", "--t1", "-1"],
+        ["compare", "pendulum", "--t1", "inf"],
+        ["compare", "pendulum", "--rtol", "0"],
+        ["compare", "pendulum", "--no-such-option"],
+        ["bench", "--parts", "magic"],
         [],
     ],
 )
