@@ -4,9 +4,11 @@ from .analyse import Structure as Structure, analyse as analyse
 from .diagnostics import Drift as Drift, drift as drift, energy as energy, multipliers as multipliers
 from .explain import Plan as Plan, explain as explain
 from .formulations import (
+    GGL as GGL,
     AbstractFormulation as AbstractFormulation,
     Baumgarte as Baumgarte,
     Differentiation as Differentiation,
+    Residual as Residual,
     StateSpace as StateSpace,
 )
 from .initialise import consistent_state as consistent_state
@@ -19,6 +21,7 @@ from .solvers import (
     Gauss4 as Gauss4,
     Midpoint as Midpoint,
     OrthogonalProjection as OrthogonalProjection,
+    RadauIIA5 as RadauIIA5,
     SymmetricProjection as SymmetricProjection,
     TangentSpace as TangentSpace,
     Trapezoid as Trapezoid,

@@ -9,30 +9,25 @@ import jax.numpy as jnp
 import numpy as np
 
 from .constraints import MechanicalODE
-from .formulations import AbstractFormulation, Differentiation, StateSpace
-from .initialise import redundancy, violation
+from .formulations import AbstractFormulation, Differentiation, Residual, StateSpace
+from .initialise import redundancy, unsolved, violation
 from .normals import SparseNormals
-from .solvers import RATTLE, AbstractManifoldSolver
-from .systems import ConstrainedSystem
+from .solvers import RATTLE, AbstractManifoldSolver, RadauIIA5
+from .systems import ConstrainedSystem, ImplicitDAE, SemiExplicitDAE
 
 
 def checked(system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any) -> tuple[Any, Any]:
     """`y0` and `args` as arrays, once their types and shapes are right."""
-    if not isinstance(system, ConstrainedSystem):
+    if isinstance(system, ConstrainedSystem):
+        _check_positions_and_velocities(y0)
+    elif isinstance(system, SemiExplicitDAE):
+        if not isinstance(y0, tuple | list) or len(y0) != 2:
+            raise ValueError(f"`y0` must be the pair (x, z) of a SemiExplicitDAE, but is {_brief(y0)}.")
+    elif not isinstance(system, ImplicitDAE):
         raise TypeError(
-            f"`system` must be a dae_jax.ConstrainedSystem, but is a {type(system).__name__}. `dae_jax.analyse` takes other "
-            "systems; to solve them is not supported yet."
+            "`system` must be a dae_jax.ConstrainedSystem, SemiExplicitDAE or ImplicitDAE, but is a "
+            f"{type(system).__name__}."
         )
-    if not isinstance(y0, tuple | list) or len(y0) != 2:
-        raise ValueError(f"`y0` must be the pair (q, v) of positions and velocities, but is {_brief(y0)}.")
-    q, v = y0
-    if jax.tree.structure(q) != jax.tree.structure(v):
-        raise ValueError("`y0` = (q, v): q and v must have the same structure.")
-    for a, b in zip(jax.tree.leaves(q), jax.tree.leaves(v), strict=True):
-        if np.shape(a) != np.shape(b):
-            raise ValueError(
-                f"`y0` = (q, v): q and v must have the same shape, but have {np.shape(a)} and {np.shape(b)}."
-            )
     for leaf in jax.tree.leaves(y0):
         dtype = jnp.result_type(leaf)
         if not jnp.issubdtype(dtype, jnp.floating):
@@ -49,8 +44,21 @@ def checked(system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any) -> tupl
     if dt0 is not None and not any(isinstance(x, jax.core.Tracer) for x in (t0, t1, dt0)) and (t1 - t0) * dt0 < 0:
         raise ValueError(f"`dt0` = {dt0} points away from `t1` = {t1}: it must have the sign of t1 − t0.")
     dtype = jnp.result_type(*jax.tree.leaves(y0))
-    y0 = jax.tree.map(lambda x: as_array(x, dtype), tuple(y0))
+    y0 = jax.tree.map(lambda x: as_array(x, dtype), y0 if isinstance(system, ImplicitDAE) else tuple(y0))
     return y0, jax.tree.map(lambda x: np.asarray(x, jnp.result_type(x)) if isinstance(x, float) else x, args)
+
+
+def _check_positions_and_velocities(y0: Any) -> None:
+    if not isinstance(y0, tuple | list) or len(y0) != 2:
+        raise ValueError(f"`y0` must be the pair (q, v) of positions and velocities, but is {_brief(y0)}.")
+    q, v = y0
+    if jax.tree.structure(q) != jax.tree.structure(v):
+        raise ValueError("`y0` = (q, v): q and v must have the same structure.")
+    for a, b in zip(jax.tree.leaves(q), jax.tree.leaves(v), strict=True):
+        if np.shape(a) != np.shape(b):
+            raise ValueError(
+                f"`y0` = (q, v): q and v must have the same shape, but have {np.shape(a)} and {np.shape(b)}."
+            )
 
 
 def as_array(x: Any, dtype: Any) -> Any:
@@ -72,6 +80,21 @@ def refuse_misfits(system: Any, formulation: Any, solver: Any, t0: Any, y0: Any,
     if not isinstance(formulation, AbstractFormulation):
         raise TypeError(
             f"`formulation` must be a formulation such as dae_jax.Baumgarte(...), but is {_brief(formulation)}."
+        )
+    name = type(solver).__name__
+    if takes_residuals(solver) and not isinstance(formulation, Residual):
+        raise ValueError(
+            f"{name} solves 0 = F(t, y, ẏ) as it is written, and takes no {type(formulation).__name__}: use "
+            "`formulation=dae_jax.Residual()`, or no `formulation`."
+        )
+    if isinstance(formulation, Residual) and not takes_residuals(solver):
+        raise ValueError(
+            f"{name} needs an ODE, and Residual is none: solve it with RadauIIA5() or BDF(), or use {name} with "
+            "Differentiation()."
+        )
+    if not isinstance(system, ConstrainedSystem) and not takes_residuals(solver):
+        raise ValueError(
+            f"{name} needs an ODE; a {type(system).__name__} is solved as it is written by RadauIIA5() or BDF()."
         )
     if isinstance(formulation, StateSpace) and isinstance(solver, AbstractManifoldSolver):
         raise ValueError(
@@ -113,8 +136,18 @@ def refuse_bad_times(saveat: Any, t0: Any, t1: Any) -> None:
                 raise ValueError("`saveat.ts` must be in the order in which the solve passes them.")
 
 
+def takes_residuals(solver: Any) -> bool:
+    """Whether a solver works on 0 = F(t, y, ẏ) in place of an ODE."""
+    return isinstance(solver, RadauIIA5)
+
+
 def refuse_bad_start(system: Any, t0: Any, y0: Any, args: Any) -> int | None:
     """Refuses an inconsistent start in words; the rank of the constraints if some are redundant."""
+    if not isinstance(system, ConstrainedSystem):
+        left = _look_at_residual(system, t0, y0, args)
+        if not bool(left.consistent()):
+            raise ValueError(left.message())
+        return None
     found, redundant = _look(system, t0, y0, args)
     if not bool(found.consistent()):
         raise ValueError(
@@ -138,6 +171,12 @@ def _look(system: Any, t: Any, y0: Any, args: Any) -> Any:
     ode = MechanicalODE.of(system, t, y0, args)
     y = ode.encode(y0)
     return violation(ode, t, y), None if isinstance(ode.linear, SparseNormals) else redundancy(ode, t, y)
+
+
+@eqx.filter_jit
+def _look_at_residual(system: Any, t: Any, y0: Any, args: Any) -> Any:
+    y, pencil = Residual().encode(system, t, y0, args)
+    return unsolved(pencil, t, y)
 
 
 def saved_parts(saveat: Any) -> list[Any]:

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 from .constraints import MechanicalODE
 from .linalg import fixed_point, implicit_root, relative_change
 from .normals import mass_solve
+from .pencil import Pencil
 from .systems import ConstrainedSystem
 
 
@@ -55,6 +56,35 @@ def violation(ode: MechanicalODE, t: Any, y: Any) -> Violation:
     root = jnp.finfo(q.dtype).eps ** 0.5
     allowed = tuple(root * (1 + jnp.max(jnp.abs(x))) for x in (q, v))
     return Violation(residuals, distances, allowed)
+
+
+class Unsolved(eqx.Module):
+    """What is left of F(t₀, y₀, ẏ₀) for the best ẏ₀, and how much of it counts as round-off of the user's numbers."""
+
+    residuals: Float[Array, " n"]
+    allowed: Float[Array, " n"]
+    equations: tuple[str, ...] = eqx.field(static=True)
+
+    def consistent(self) -> Bool[Array, ""]:
+        """Whether every equation has a solution; false for NaN."""
+        return jnp.all(jnp.abs(self.residuals) <= self.allowed)
+
+    def message(self) -> str:
+        """Which equations are off, and by how much."""
+        off = np.flatnonzero(~(np.abs(np.asarray(self.residuals)) <= np.asarray(self.allowed)))
+        lines = [f"  0 = {self.equations[i]} is off by {float(self.residuals[i]):.6g}" for i in off]
+        return "The initial state `y0` violates the equations, whatever its derivative:\n" + "\n".join(lines)
+
+
+def unsolved(pencil: Pencil, t: Any, y: Float[Array, " n"]) -> Unsolved:
+    """What no ẏ makes vanish of F(t, y, ẏ)."""
+    t = jnp.asarray(t, y.dtype)
+    yd = pencil.rates(t, y)
+    j, m = pencil.jacobians(t, y, yd)
+    size = lambda x: 1 + jnp.max(jnp.abs(x))
+    ones = jnp.ones_like(y)
+    terms = pencil.storage.apply(jnp.abs(j), size(y) * ones) + pencil.storage.apply(jnp.abs(m), size(yd) * ones)
+    return Unsolved(pencil.residual(t, y, yd), jnp.finfo(y.dtype).eps ** 0.5 * terms, pencil.form.equations)
 
 
 class Redundancy(eqx.Module):

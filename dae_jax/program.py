@@ -14,13 +14,22 @@ import optimistix
 
 from .checks import is_saved_part, saved_parts
 from .constraints import MechanicalODE
-from .formulations import AbstractFormulation
-from .initialise import redundancy, violation
+from .formulations import AbstractFormulation, Residual
+from .initialise import redundancy, unsolved, violation
 from .kernels import PullBack, inexact, one_kernel, one_kernel_enabled
 from .linalg import rms_norm
 from .solution import RESULTS, DAESolution, Interpolation, all_finite
-from .solvers import DOP853, AbstractManifoldSolver, OrthogonalProjection, TangentSpace, unrolled
+from .solvers import (
+    DOP853,
+    AbstractManifoldSolver,
+    OrthogonalProjection,
+    RadauIIA5,
+    TangentSpace,
+    first_step,
+    unrolled,
+)
 from .solvers.tangent_space import TangentPoint
+from .systems import ConstrainedSystem
 from .tape import Taped, as_it_is, can_be_taped, cotangents, recorded, saved_times
 
 
@@ -109,9 +118,13 @@ class Solve(eqx.Module):
     ) -> tuple[DAESolution, Any]:
         numbers, arrays, outline = self.kernel(system, t0, t1, dt0, y0, args, rank)
         out = one_kernel(numbers, self.derivative(), self._pull_back(system, t0, t1, dt0, y0, args, rank))(arrays)
-        ode = MechanicalODE.of(system, t0, y0, args, rank)
-        start = ode.encode(y0)
-        consistent = violation(ode, t0, start).consistent()
+        if isinstance(system, ConstrainedSystem):
+            ode = MechanicalODE.of(system, t0, y0, args, rank)
+            start = ode.encode(y0)
+            consistent = violation(ode, t0, start).consistent()
+        else:
+            start, pencil = self.formulation.encode(system, t0, y0, args)
+            consistent = unsolved(pencil, t0, start).consistent()
         sol = self._solution(eqx.combine(out, outline[0]), args, rank, consistent)
         return sol, consistent if rank is None else consistent & (redundancy(ode, t0, start).rank == rank)
 
@@ -184,6 +197,10 @@ class Solve(eqx.Module):
     def _diffeqsolve(self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, rank: int | None) -> Any:
         y, ode = self.formulation.encode(system, t0, y0, args, rank)
         decode = _Decode(self.formulation, self.solver)
+        solver, controller = _economical(self.solver, self.between()), _fitted(self.controller, t0, t1)
+        if isinstance(self.formulation, Residual):
+            solver, controller = _of_residuals(solver, controller)
+            dt0 = first_step(ode, solver, t0, t1, y) if dt0 is None else dt0
 
         def saved(part: Any) -> Any:
             return part if part.fn is as_it_is else eqx.tree_at(lambda s: s.fn, part, _View(part.fn, decode, args))
@@ -200,9 +217,9 @@ class Solve(eqx.Module):
         )
         sol = diffrax.diffeqsolve(
             self.formulation.term(),
-            _economical(self.solver, self.between()),
+            solver,
             t0, t1, dt0, y,
-            args=ode, saveat=saveat, stepsize_controller=_fitted(self.controller, t0, t1), adjoint=self.adjoint, event=event,
+            args=ode, saveat=saveat, stepsize_controller=controller, adjoint=self.adjoint, event=event,
             max_steps=self.max_steps, throw=False, progress_meter=self.progress_meter,
         )  # fmt: skip
         interpolation = None
@@ -215,6 +232,10 @@ class Solve(eqx.Module):
         code = RESULTS.promote(result)
         _, _, ts, ys, *_ = fields
         failed = lambda name, instead, when=True: RESULTS.where((code == name) & when, instead, code)
+        if isinstance(self.formulation, Residual):
+            code = failed(RESULTS.dt_min_reached, RESULTS.error_too_large)
+            code = failed(RESULTS.nonlinear_divergence, RESULTS.no_convergence)
+            code = failed(RESULTS.singular, RESULTS.singular_iteration_matrix)
         code = failed(RESULTS.dt_min_reached, RESULTS.step_rejected)
         code = failed(RESULTS.nonlinear_divergence, RESULTS.off_manifold)
         if ts is not None:
@@ -244,6 +265,14 @@ def _fitted(controller: Any, t0: Any, t1: Any) -> Any:
         return controller
     floor = 16 * jnp.finfo(jnp.result_type(t0)).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
     return dataclasses.replace(controller, dtmin=floor, force_dtmin=False)
+
+
+def _of_residuals(solver: Any, controller: Any) -> tuple[Any, Any]:
+    """A solver with the controller's tolerances; it finds by itself where time resolves no smaller step."""
+    if type(controller) is not diffrax.PIDController:
+        return solver, controller
+    rtol, atol = (getattr(solver, name) or getattr(controller, name) for name in ("rtol", "atol"))
+    return dataclasses.replace(solver, rtol=rtol, atol=atol), dataclasses.replace(controller, dtmin=None)
 
 
 def _uniform(solver: Any, path: diffrax.DenseInterpolation) -> diffrax.DenseInterpolation:

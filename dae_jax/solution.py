@@ -30,6 +30,20 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "The nonlinear equations of a step had no solution within reach: the step is too large for the manifold's "
         "curvature, or the constraints contradict each other or become dependent. Take smaller steps."
     )
+    singular_iteration_matrix = (
+        "The iteration matrix ∂F/∂y + c ∂F/∂ẏ is singular, however small the step: the equations do not determine all "
+        "unknowns here. `dae_jax.analyse` shows the index and which variable each equation determines."
+    )
+    no_convergence = (
+        "Newton's method did not converge for the equations of a step, however small: a function has a jump or a kink "
+        "there, leaves its domain (NaN), or the equations have no solution beyond. For an index of 3, try a form of lower "
+        "index (`Residual('index-2')`, `GGL()`) or another method."
+    )
+    error_too_large = (
+        "The error of a step stayed above the tolerance, however small the step: the solution is not smooth there, grows "
+        "without bound, or the tolerance is below round-off. Try a larger `atol`, a lower index (`dae_jax.analyse` shows "
+        "it), or another method."
+    )
 
 
 class Interpolation(eqx.Module):

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .checks import as_array, checked, refuse_bad_start, refuse_bad_times, refuse_misfits
-from .formulations import AbstractFormulation, Differentiation
+from .checks import as_array, checked, refuse_bad_start, refuse_bad_times, refuse_misfits, takes_residuals
+from .formulations import AbstractFormulation, Differentiation, Residual
 from .program import Program, Solve, run, split
 from .solution import RESULTS, DAESolution
 from .systems import ConstrainedSystem
@@ -63,7 +63,7 @@ def daesolve(
     )  # fmt: skip
     program, arrays = split(inputs)
     if any(isinstance(x, jax.core.Tracer) for x in arrays):
-        sol, _ = run(program, system.rank, arrays)
+        sol, _ = run(program, getattr(system, "rank", None), arrays)
     else:
         sol = _run_on_numbers(program, arrays, inputs)
     return _raise_if_failed(sol) if throw else sol
@@ -75,7 +75,8 @@ def prepared(
 ) -> tuple[Solve, Any, Any, Any, Any, Any, Any]:  # fmt: skip
     """The method and (system, t0, t1, dt0, y0, args) of a solve, checked, with the defaults filled in."""
     y0, args = checked(system, t0, t1, dt0, y0, args)
-    formulation = Differentiation() if formulation is None else formulation
+    if formulation is None:
+        formulation = Residual() if takes_residuals(solver) else Differentiation()
     refuse_misfits(system, formulation, solver, t0, y0, args)
     dtype = jnp.result_type(*jax.tree.leaves(y0))
     if stepsize_controller is None:

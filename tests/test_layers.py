@@ -12,7 +12,7 @@ import pytest
 PACKAGE = Path(__file__).parent.parent / "dae_jax"
 LAYERS = (
     {"kernels", "linalg", "structure"},
-    {"constraints", "initialise", "normals", "residual", "systems"},
+    {"constraints", "initialise", "normals", "pencil", "residual", "systems"},
     {"formulations", "solvers"},
     {"analyse", "checks", "diagnostics", "explain", "program", "solution", "solve", "tape"},
     {"compare", "plotting", "scenes", "sweep", "tune"},

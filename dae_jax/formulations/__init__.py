@@ -6,4 +6,5 @@ Each has `encode(system, t, state, args) → (y, ode)`, `term()` and `decode(t, 
 
 from .baumgarte import Baumgarte as Baumgarte
 from .differentiation import AbstractFormulation as AbstractFormulation, Differentiation as Differentiation
+from .residual import GGL as GGL, Residual as Residual
 from .state_space import StateSpace as StateSpace

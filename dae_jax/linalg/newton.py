@@ -94,28 +94,36 @@ def fixed_point(
 
 def implicit_root(
     residual: Callable[[Float[Array, " n"], Any], Float[Array, " n"]],
-    iterate: Callable[[Any], tuple[Float[Array, " n"], Bool[Array, ""]]],
+    iterate: Callable[[Any], tuple[Float[Array, " n"], Any]],
     params: Any,
     *,
-    linear_solve: Callable[[Float[Array, "n n"], Float[Array, " n"]], Float[Array, " n"]] = solve,
-) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
-    """`iterate(params)` → (x, converged) with the derivative of the solution of residual(x, params) = 0.
+    linear_solve: Callable[[Any, Float[Array, " n"]], Float[Array, " n"]] = solve,
+    jacobian: Callable[[Float[Array, " n"], Any], Any] | None = None,
+) -> tuple[Float[Array, " n"], Any]:
+    """`iterate(params)` → (x, how it went) with the derivative of the solution of residual(x, params) = 0.
 
-    By the implicit function theorem; the iteration is not differentiated. Everything that is traced and that `residual`
-    or `iterate` depends on must be in `params`, a pytree.
+    By the implicit function theorem; the iteration is not differentiated, and how it went (any pytree of arrays) has no
+    derivative. Everything that is traced and that `residual` or `iterate` depends on must be in `params`, a pytree.
+    `linear_solve` gets what `jacobian(x, params)` gives, by default the matrix ∂residual/∂x.
     """
     arrays, static = eqx.partition(params, eqx.is_array)
+    jacobian = jax.jacfwd(residual) if jacobian is None else jacobian
 
     @jax.custom_jvp
-    def find(arrays: Any) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
+    def find(arrays: Any) -> tuple[Float[Array, " n"], Any]:
         return iterate(eqx.combine(arrays, static))
 
     @find.defjvp
     def _(primals: Any, tangents: Any) -> Any:
         (arrays,), (directions,) = primals, tangents
-        x, converged = find(arrays)
+        x, outcome = find(arrays)
         _, change = jax.jvp(lambda a: residual(x, eqx.combine(a, static)), (arrays,), (directions,))
-        dx = -linear_solve(jax.jacfwd(residual)(x, eqx.combine(arrays, static)), change)
-        return (x, converged), (dx, np.zeros((), jax.dtypes.float0))
+        dx = -linear_solve(jacobian(x, eqx.combine(arrays, static)), change)
+        return (x, outcome), (dx, jax.tree.map(_no_tangent, outcome))
 
     return find(arrays)
+
+
+def _no_tangent(x: Any) -> Any:
+    inexact = jnp.issubdtype(x.dtype, jnp.inexact)
+    return jnp.zeros_like(x) if inexact else np.zeros(x.shape, jax.dtypes.float0)

@@ -16,4 +16,9 @@ from .ordering import (
     reverse_cuthill_mckee as reverse_cuthill_mckee,
 )
 from .pantelides import Pantelides as Pantelides, pantelides as pantelides
-from .sigma import SigmaAnalysis as SigmaAnalysis, jacobian_pattern as jacobian_pattern, sigma_method as sigma_method
+from .sigma import (
+    SigmaAnalysis as SigmaAnalysis,
+    jacobian_pattern as jacobian_pattern,
+    sigma_method as sigma_method,
+    variable_indices as variable_indices,
+)

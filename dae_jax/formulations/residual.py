@@ -1,0 +1,62 @@
+"""The equations as they are written, 0 = F(t, y, ẏ), for solvers that take them so."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from ..constraints import MechanicalODE
+from ..pencil import Pencil
+from ..residual import Form, ResidualForm
+from ..systems import ConstrainedSystem
+from .differentiation import AbstractFormulation
+
+
+class Residual(AbstractFormulation):
+    """No equation is differentiated by hand: 0 = F(t, y, ẏ), for `RadauIIA5` and `BDF`.
+
+    **Arguments**
+
+    - `form`: for a `ConstrainedSystem`, "index-3", "index-2" or "GGL" (see `ResidualForm` for the equations); other
+      systems are taken as they are.
+    - `variable_index`: the index of each unknown, in the order of `ResidualForm.variables`. The error of a variable of
+      index k counts with h^(k−1) in step-size control. By default found by structural analysis.
+    """
+
+    form: Form = eqx.field(static=True, default="GGL")
+    variable_index: tuple[int, ...] | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self) -> None:
+        if self.form not in ("index-3", "index-2", "GGL"):
+            raise ValueError(f'`form` must be "index-3", "index-2" or "GGL", but is {self.form!r}.')
+
+    def encode(self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None) -> tuple[Any, Pencil]:
+        form = ResidualForm.of(system, t, state, args, self.form)
+        y = form.encode(state)
+        if self.variable_index is not None and len(self.variable_index) != form.size:
+            raise ValueError(
+                f"`variable_index` must have a number for each of {', '.join(form.variables)}: {form.size} in all, but has "
+                f"{len(self.variable_index)}."
+            )
+        if isinstance(system, ConstrainedSystem):
+            if rank is not None:
+                raise ValueError(
+                    "Some constraints are redundant, which leaves their multipliers undetermined: a residual needs "
+                    "independent ones. Remove the redundant constraints, or use a solver of the underlying ODE such as "
+                    "OrthogonalProjection."
+                )
+            ode = MechanicalODE.of(system, t, state, args)
+            multipliers = ode.multipliers(t, ode.encode(state))
+            y = jnp.concatenate([y[: form.layout.size], multipliers, jnp.zeros(form.extra - multipliers.size, y.dtype)])
+        return y, Pencil.of(form, t, y, self.variable_index)
+
+    def field(self, t: Any, y: Any, ode: Any) -> Any:
+        """NaN: a residual has no ẏ in explicit form."""
+        return jnp.full_like(y, jnp.nan)
+
+
+def GGL() -> Residual:
+    """The stabilised index-2 form of Gear, Gupta and Leimkuhler: the constraint and its derivative both hold, with an extra
+    multiplier η that vanishes for the exact solution.
+    """
+    return Residual("GGL")

@@ -1,0 +1,208 @@
+"""Square matrices that are factorised once and used many times, real or complex: dense, or in a band.
+
+A matrix is an array of what its storage keeps of it; `factor` gives a pytree of arrays, `solve` uses it, and both are
+derived by JAX in both modes. The unknowns of a band are reordered inside: vectors go in and come out in their own order.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Inexact, Int
+
+from .dense import LOOPED
+
+
+@dataclasses.dataclass(frozen=True)
+class Dense:
+    """All entries. Up to 32 unknowns the factors are the inverse, found in plain arithmetic, so that to solve is one sum;
+    LU by LAPACK above.
+    """
+
+    size: int
+
+    def factor(self, a: Inexact[Array, "n n"]) -> tuple[Any, Float[Array, ""]]:
+        """The factors, and the smallest pivot relative to the entries of its row: round-off where A is singular."""
+        scale = _row_scale(a)
+        if self.size <= LOOPED:
+            inverse, smallest = _inverse(a * scale[:, None])
+            return inverse * scale, smallest
+        lu, pivots, order = lax.linalg.lu(a * scale[:, None])
+        return (lu, pivots, order, scale), jnp.min(jnp.abs(jnp.diagonal(lu)))
+
+    def solve(self, factors: Any, b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
+        """x with A x = b."""
+        if self.size <= LOOPED:
+            return jnp.sum(factors * b, 1)
+        lu, _, order, scale = factors
+        y = lax.linalg.triangular_solve(lu, (scale * b)[order][:, None], left_side=True, lower=True, unit_diagonal=True)
+        return lax.linalg.triangular_solve(lu, y, left_side=True)[:, 0]
+
+    def apply(self, a: Inexact[Array, "n n"], x: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
+        """A x."""
+        return jnp.sum(a * x, 1) if self.size <= LOOPED else jnp.dot(a, x, precision=lax.Precision.HIGHEST)
+
+    def scale_columns(self, a: Inexact[Array, "n n"], scale: Inexact[Array, " n"]) -> Inexact[Array, "n n"]:
+        """A diag(scale)."""
+        return a * scale
+
+    def coupled(
+        self, parts: list[Inexact[Array, "n n"]], others: list[Inexact[Array, "n n"]], weights: Float[Array, "s s"]
+    ) -> tuple["Dense", Inexact[Array, "sn sn"]]:
+        """The matrix of s coupled copies, block (i, j) = δᵢⱼ partsᵢ + weightsᵢⱼ othersᵢ, unknowns of a copy interleaved."""
+        s = len(parts)
+        blocks = jnp.stack(
+            [jnp.stack([(parts[i] if i == j else 0) + weights[i, j] * others[i] for j in range(s)]) for i in range(s)]
+        )
+        return Dense(s * self.size), jnp.transpose(blocks, (2, 0, 3, 1)).reshape(s * self.size, s * self.size)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Banded:
+    """Entry (i, i + k − `lower`) at [i, k], for k up to `lower` + `upper`, after `rows` and `columns` are put in order.
+
+    Compared by identity. Source of the elimination: G. H. Golub, C. F. Van Loan, *Matrix Computations*, 4.3.3.
+    """
+
+    rows: Int[np.ndarray, " n"]
+    columns: Int[np.ndarray, " n"]
+    lower: int
+    upper: int
+
+    @property
+    def size(self) -> int:
+        """The number of unknowns."""
+        return len(self.rows)
+
+    @property
+    def width(self) -> int:
+        """Entries kept of a row."""
+        return self.lower + 1 + self.upper
+
+    def positions(self) -> tuple[Int[np.ndarray, "n width"], Int[np.ndarray, "n width"]]:
+        """Row and column, in the vectors' own order, of each entry; −1 for columns outside."""
+        places = np.arange(self.size)[:, None] + np.arange(-self.lower, self.upper + 1)
+        inside = (places >= 0) & (places < self.size)
+        columns = np.where(inside, self.columns[np.clip(places, 0, self.size - 1)], -1)
+        return np.broadcast_to(self.rows[:, None], columns.shape), columns
+
+    def factor(self, a: Inexact[Array, "n width"]) -> tuple[Any, Float[Array, ""]]:
+        """The factors, by Gaussian elimination with partial pivoting in a window that moves down the band."""
+        scale = _row_scale(a)
+        lower, reach = self.lower, self.lower + self.upper + 1
+        if not lower:
+            upper = (a * scale[:, None], scale)
+            return upper, jnp.min(jnp.abs(upper[0][:, 0]))
+        # Row i + lower joins when column i is eliminated; below the matrix stands the identity.
+        rows = jnp.concatenate([a * scale[:, None], jnp.zeros((lower, self.width), a.dtype)])
+        padded = jnp.pad(rows, ((0, 0), (0, reach - self.width)))
+        padded = padded.at[self.size :, lower].set(1)
+        window = jnp.stack([jnp.roll(padded[i], i - lower) for i in range(lower)])
+        window = jnp.stack([jnp.where(np.arange(reach) < reach - lower + i, window[i], 0) for i in range(lower)])
+        places = jnp.arange(lower + 1)
+
+        def eliminate(window: Any, row: Any) -> Any:
+            window = jnp.concatenate([window, row[None]])
+            pivot = jnp.argmax(_size(window[:, 0]))
+            pivot_row = lax.dynamic_index_in_dim(window, pivot, 0, keepdims=False)
+            rest = jnp.where((places == pivot)[:, None], window[0], window)[1:]
+            factors = rest[:, 0] / pivot_row[0]
+            rest = rest[:, 1:] - factors[:, None] * pivot_row[1:]
+            return jnp.pad(rest, ((0, 0), (0, 1))), (pivot_row, factors, pivot)
+
+        _, (upper, factors, pivots) = lax.scan(eliminate, window, padded[lower:])
+        return (upper, factors, pivots, scale), jnp.min(jnp.abs(upper[:, 0]))
+
+    def solve(self, factors: Any, b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
+        """x with A x = b."""
+        upper, *eliminations, scale = factors
+        b = (b[self.rows] * scale).astype(jnp.result_type(b, upper))
+        lower, ahead = self.lower, upper.shape[1] - 1
+        if lower:
+            lower_factors, pivots = eliminations
+            places = jnp.arange(lower + 1)
+            padded = jnp.concatenate([b, jnp.zeros(lower, b.dtype)])
+
+            def forward(window: Any, given: Any) -> Any:
+                entry, factors, pivot = given
+                window = jnp.concatenate([window, entry[None]])
+                first = jnp.sum(jnp.where(places == pivot, window, 0))
+                rest = jnp.where(places == pivot, window[0], window)[1:]
+                return rest - factors * first, first
+
+            _, b = lax.scan(forward, padded[:lower], (padded[lower:], lower_factors, pivots))
+
+        def backward(window: Any, given: Any) -> Any:
+            entry, row = given
+            x = (entry - jnp.sum(row[1:] * window)) / row[0]
+            return jnp.concatenate([x[None], window])[:ahead], x
+
+        _, x = lax.scan(backward, jnp.zeros(ahead, b.dtype), (b, upper), reverse=True)
+        return x[np.argsort(self.columns)]
+
+    def apply(self, a: Inexact[Array, "n width"], x: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
+        """A x."""
+        _, columns = self.positions()
+        return jnp.sum(a * jnp.where(columns >= 0, x[columns], 0), 1)[np.argsort(self.rows)]
+
+    def scale_columns(self, a: Inexact[Array, "n width"], scale: Inexact[Array, " n"]) -> Inexact[Array, "n width"]:
+        """A diag(scale)."""
+        return a * scale[self.positions()[1]]
+
+    def coupled(
+        self, parts: list[Inexact[Array, "n width"]], others: list[Inexact[Array, "n width"]], weights: Float[Array, "s s"]
+    ) -> tuple["Banded", Inexact[Array, "sn width"]]:
+        """The matrix of s coupled copies, block (i, j) = δᵢⱼ partsᵢ + weightsᵢⱼ othersᵢ, unknowns of a copy interleaved."""
+        s, n = len(parts), self.size
+        rows = []
+        for i in range(s):
+            entries = jnp.stack([(parts[i] if i == j else 0) + weights[i, j] * others[i] for j in range(s)], 2)
+            rows.append(jnp.pad(entries.reshape(n, s * self.width), ((0, 0), (s - 1 - i, i))))
+        interleave = lambda order: (s * order[:, None] + np.arange(s)).reshape(-1)
+        band = Banded(interleave(self.rows), interleave(self.columns), s * self.lower + s - 1, s * self.upper + s - 1)
+        return band, jnp.stack(rows, 1).reshape(s * n, -1)
+
+
+Storage = Dense | Banded
+
+
+def _row_scale(a: Inexact[Array, "n k"]) -> Float[Array, " n"]:
+    largest = jnp.max(_size(a), 1)
+    return 1 / jnp.where(largest > 0, largest, 1)
+
+
+def _size(x: Inexact[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Of the order of |x|, without a square root."""
+    return jnp.abs(jnp.real(x)) + jnp.abs(jnp.imag(x)) if jnp.iscomplexobj(x) else jnp.abs(x)
+
+
+def _inverse(a: Inexact[Array, "n n"]) -> tuple[Inexact[Array, "n n"], Float[Array, ""]]:
+    """The inverse by Gauss–Jordan elimination with partial pivoting, in place, and the smallest pivot."""
+    n = a.shape[0]
+    places = jnp.arange(n)
+
+    def eliminate(j: Any, carry: Any) -> Any:
+        a, order, smallest = carry
+        column = lax.dynamic_slice_in_dim(a, j, 1, 1)[:, 0]
+        pivot = jnp.argmax(jnp.where(places >= j, _size(column), -1))
+        row_j = lax.dynamic_index_in_dim(a, j, 0, keepdims=False)
+        row_pivot = lax.dynamic_index_in_dim(a, pivot, 0, keepdims=False)
+        value = lax.dynamic_index_in_dim(row_pivot, j, 0, keepdims=False)
+        row = jnp.where(places == j, 1, row_pivot) / value
+        at_j, at_pivot = places == j, places == pivot
+        column = jnp.where(at_pivot, lax.dynamic_index_in_dim(column, j, 0, keepdims=False), column)
+        cleared = jnp.where(at_pivot[:, None], row_j, a)
+        cleared = jnp.where(at_j, 0, cleared) - column[:, None] * row
+        a = jnp.where(at_j[:, None], row, cleared)
+        first, second = order[j], order[pivot]
+        order = jnp.where(at_j, second, jnp.where(at_pivot, first, order))
+        return a, order, jnp.minimum(smallest, _size(value))
+
+    smallest = jnp.asarray(jnp.inf, jnp.finfo(a.dtype).dtype)
+    a, order, smallest = lax.fori_loop(0, n, eliminate, (a, places, smallest))
+    # The columns of the inverse are those of the rows as they were exchanged.
+    back = jnp.sum(jnp.where(order[:, None] == places, places[:, None], 0), 0)
+    return a[:, back], smallest

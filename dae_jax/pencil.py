@@ -1,0 +1,210 @@
+"""The linearisation of 0 = F(t, y, ẏ): what a solver of residuals needs to solve for a step."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Inexact, Int
+
+from .constraints import at_one_instant
+from .linalg.dense import LOOPED
+from .linalg.storage import Banded, Dense, Storage
+from .residual import ResidualForm
+from .structure import (
+    StructurallySingular,
+    bandwidth,
+    column_colouring,
+    dependence,
+    reverse_cuthill_mckee,
+    seed_matrix,
+    sigma_method,
+    signature,
+    variable_indices,
+)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Compression:
+    """A Jacobian as the directional derivatives along `seeds`, and where its stored entries are among them (−1: 0)."""
+
+    seeds: Float[np.ndarray, "colours n"]
+    places: Int[np.ndarray, "n width"]
+
+    def entries(self, compressed: Float[Array, "colours n"]) -> Float[Array, "n width"]:
+        """The stored entries."""
+        return jnp.where(self.places >= 0, compressed.reshape(-1)[self.places], 0)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Outline:
+    """What is known of a residual's linearisation before it is evaluated. Compared by identity: keep one for a pattern.
+
+    `indices`, `offsets`: the index of each variable, and how often it is differentiated (d of the Σ-method);
+    `differential`: whether its derivative occurs; `by_y`, `by_rate`: the compressed Jacobians, `None` for small ones.
+    """
+
+    storage: Storage
+    indices: tuple[int, ...]
+    offsets: tuple[int, ...]
+    differential: Bool[np.ndarray, " n"]
+    by_y: Compression | None
+    by_rate: Compression | None
+
+
+class Pencil(eqx.Module):
+    """J + c M with J = ∂F/∂y and M = ∂F/∂ẏ, of a `ResidualForm`. It travels through `diffrax.diffeqsolve` as `args`."""
+
+    form: ResidualForm
+    outline: Outline = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, form: ResidualForm, t: Any, y: Float[Array, " n"], indices: tuple[int, ...] | None = None) -> "Pencil":
+        """Finds, while tracing, which equation depends on which variable and derivative.
+
+        Errors: `ValueError` for a structurally singular system.
+        """
+        like = jax.ShapeDtypeStruct(y.shape, y.dtype)
+        try:
+            time = jax.ShapeDtypeStruct((), y.dtype)
+            _, on_y, on_rate = dependence(form.residual, time, like, like, derivative=True)
+        except NotImplementedError:
+            # A primitive that structural analysis does not know: all may depend on all.
+            on_y = on_rate = np.ones((y.size, y.size), bool)
+        try:
+            outline = _outline(on_y.tobytes(), on_rate.tobytes(), y.size)
+        except StructurallySingular as singular:
+            equations = ", ".join(form.equations[i] for i in singular.equations)
+            raise ValueError(
+                f"The system is structurally singular: the equations {equations or '(none)'} have too few variables between "
+                "them, or some variables too few equations. `dae_jax.analyse(system, t0, y0, args)` names them all."
+            ) from None
+        if indices is not None:
+            outline = dataclasses.replace(outline, indices=indices)
+        return cls(form, outline)
+
+    @property
+    def storage(self) -> Storage:
+        """How J and M are stored."""
+        return self.outline.storage
+
+    def decode(self, t: Any, y: Float[Array, " n"]) -> Any:
+        """The state in the user's structure."""
+        return self.form.decode(t, y)
+
+    def residual(self, t: Any, y: Float[Array, " n"], yd: Float[Array, " n"]) -> Float[Array, " n"]:
+        """F(t, y, ẏ)."""
+        return self.form.residual(t, y, yd)
+
+    def jacobians(self, t: Any, y: Float[Array, " n"], yd: Float[Array, " n"]) -> tuple[Array, Array]:
+        """J and M."""
+        t = jnp.asarray(t, y.dtype)
+        if self.outline.by_y is None or self.outline.by_rate is None:
+            return self._all_entries(t, y, yd)
+        along_y = lambda seed: jax.jvp(lambda y: self.residual(t, y, yd), (y,), (seed,))[1]
+        along_rate = lambda seed: jax.jvp(lambda yd: self.residual(t, y, yd), (yd,), (seed,))[1]
+        found = []
+        for along, compression in ((along_y, self.outline.by_y), (along_rate, self.outline.by_rate)):
+            found.append(compression.entries(jax.vmap(along)(jnp.asarray(compression.seeds, y.dtype))))
+        return found[0], found[1]
+
+    @at_one_instant
+    def _all_entries(self, t: Any, y: Float[Array, " n"], yd: Float[Array, " n"]) -> tuple[Array, Array]:
+        return jax.jacfwd(self.form.residual, 1)(t, y, yd), jax.jacfwd(self.form.residual, 2)(t, y, yd)
+
+    def factor(self, j: Array, m: Array, c: Any, h: Any) -> tuple[Any, Float[Array, ""]]:
+        """The factors of J + c M, for c of the order of 1/h, and the smallest pivot, of round-off size for a singular one.
+
+        With column j scaled by h^dⱼ, the rows tend with h → 0 to those of the Σ-method's system Jacobian, however high the
+        index; without, the condition would grow like h^(−index).
+        """
+        scale = self.column_scale(h)
+        factors, smallest = self.storage.factor(self.storage.scale_columns(j + c * m, scale))
+        return (factors, scale), smallest
+
+    def column_scale(self, h: Any) -> Float[Array, " n"]:
+        """h^dⱼ."""
+        return powers(jnp.minimum(jnp.abs(h), 1), self.outline.offsets)
+
+    def solve(self, factors: Any, b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
+        """x with (J + c M) x = b."""
+        inner, scale = factors
+        return scale * self.storage.solve(inner, b)
+
+    def rates(self, t: Any, y: Float[Array, " n"]) -> Float[Array, " n"]:
+        """ẏ with F(t, y, ẏ) = 0 where y is consistent; 0 for variables whose derivative does not occur.
+
+        Newton's method with M + ε J in place of the singular M, at an ε far below the time scales of J: an implicit Euler
+        step of that size.
+        """
+        yd = jnp.zeros_like(y)
+        for _ in range(3):
+            j, m = self.jacobians(t, y, yd)
+            largest = lambda x: jnp.max(jnp.abs(x))
+            step = jnp.finfo(y.dtype).eps ** 0.5 * largest(m) / jnp.maximum(largest(j), jnp.finfo(y.dtype).tiny)
+            step = jnp.where((step > 0) & (step < 1), step, jnp.finfo(y.dtype).eps ** 0.5)
+            factors, _ = self.factor(j, m, 1 / step, step)
+            delta = self.solve(factors, self.residual(t, y, yd)) / step
+            yd = jnp.where(self.outline.differential, yd - delta, 0)
+        return yd
+
+    def weights(self, h: Any) -> Float[Array, " n"]:
+        """h^(k−1) for a variable of index k > 1: how much of its error counts.
+
+        Source: E. Hairer, G. Wanner, *Solving Ordinary Differential Equations II*, VII.3 and the program RADAU5.
+        """
+        return powers(jnp.minimum(jnp.abs(h), 1), tuple(max(k - 1, 0) for k in self.outline.indices))
+
+
+def powers(x: Float[Array, ""], exponents: tuple[int, ...]) -> Float[Array, " n"]:
+    """x to each of the exponents."""
+    values = [jnp.ones_like(x)]
+    for _ in range(max(exponents, default=0)):
+        values.append(values[-1] * x)
+    return jnp.stack([values[k] for k in exponents]) if len(exponents) <= LOOPED else jnp.stack(values)[np.array(exponents)]
+
+
+@functools.lru_cache(maxsize=64)
+def _outline(on_y: bytes, on_rate: bytes, n: int) -> Outline:
+    by_y, by_rate = (np.frombuffer(x, bool).reshape(n, n) for x in (on_y, on_rate))
+    found = signature(by_y, by_rate)
+    sigma = sigma_method(found)
+    storage = _storage(by_y | by_rate, sigma.transversal)
+    small = n <= LOOPED
+    return Outline(
+        storage,
+        variable_indices(found, sigma),
+        sigma.variable_offsets,
+        by_rate.any(0),
+        None if small else _compression(by_y, storage),
+        None if small else _compression(by_rate, storage),
+    )
+
+
+def _storage(pattern: Bool[np.ndarray, "n n"], transversal: tuple[int, ...]) -> Storage:
+    """A band, with each equation in the place of its variable, where that is cheaper."""
+    n = len(pattern)
+    if n <= LOOPED:
+        return Dense(n)
+    equation_of = np.argsort(transversal)
+    paired = pattern[equation_of]
+    order = reverse_cuthill_mckee(paired | paired.T)
+    ordered = paired[np.ix_(order, order)]
+    lower, upper = bandwidth(np.tril(ordered)), bandwidth(np.triu(ordered))
+    if 4 * (lower + 1) * (lower + upper + 1) > n * n:
+        return Dense(n)
+    return Banded(equation_of[order], order, lower, upper)
+
+
+def _compression(pattern: Bool[np.ndarray, "n n"], storage: Storage) -> Compression:
+    n = len(pattern)
+    colours = column_colouring(pattern)
+    if isinstance(storage, Banded):
+        rows, columns = storage.positions()
+    else:
+        rows, columns = np.indices((n, n))
+    used = (columns >= 0) & pattern[rows, columns]
+    return Compression(seed_matrix(colours).T, np.where(used, colours[columns] * n + rows, -1))

@@ -1,0 +1,272 @@
+"""Radau IIA with three stages for 0 = F(t, y, ẏ)."""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from ..linalg import implicit_root, rms_norm
+from .manifold import clock
+from .radau_coefficients import ALPHA, BACK, BETA, ERROR, GAMMA, INVERSE, NODES, POLYNOMIAL, TRANSFORM
+from .residual_steps import Tolerances, at_the_floor, constant, of_step, tolerances
+
+
+NEWTON_STEPS = 10
+# The Jacobian is kept for the next step while Newton's method contracts faster than this.
+FAST = 1e-2
+
+
+class CollocationPolynomial(diffrax.AbstractLocalInterpolation):
+    """The polynomial of degree 3 through the step's start and its stages y₀ + zᵢ."""
+
+    t0: Any
+    t1: Any
+    y0: Any
+    z: Any
+
+    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Any:
+        """The value at `t0`, or the increment from there to `t1`."""
+        if t1 is not None:
+            return self.evaluate(t1) - self.evaluate(t0)
+        h = self.t1 - self.t0
+        return self.y0 + _along(self.z, (t0 - self.t0) / jnp.where(h == 0, 1, h))
+
+
+def _along(z: Float[Array, "3 n"], s: Any) -> Float[Array, " n"]:
+    c = _combined(POLYNOMIAL, z)
+    return s * (c[0] + s * (c[1] + s * c[2]))
+
+
+def _combined(a: Any, x: Any) -> list[Any]:
+    """A x for a matrix of numbers and the rows of x, written out."""
+    return [sum(float(c) * x[k] for k, c in enumerate(row)) for row in a]
+
+
+class _State(NamedTuple):
+    """What a step leaves to the next.
+
+    `z`, `h`: stages and size of the last step, h = 0 before the first; `rates`: ẏ at its end; `jacobians`, `factors`
+    (for the size `factored`); `refresh`: whether the Jacobians are to be evaluated anew; `eta`: θ/(1 − θ) of Newton's
+    method.
+    """
+
+    z: Float[Array, "3 n"]
+    h: Float[Array, ""]
+    rates: Float[Array, " n"]
+    jacobians: Any
+    factors: Any
+    factored: Float[Array, ""]
+    refresh: Bool[Array, ""]
+    eta: Float[Array, ""]
+
+
+class _Step(NamedTuple):
+    """The equations of a step: a pytree, so that they can be differentiated."""
+
+    pencil: Any
+    sign: Any
+    t0: Any
+    t1: Any
+    y0: Float[Array, " n"]
+
+    @property
+    def h(self) -> Any:
+        return self.t1 - self.t0
+
+    def stages(self, z: Float[Array, "3 n"]) -> Any:
+        """(tᵢ, Yᵢ, ẏ at tᵢ) of each stage."""
+        rates = _combined(INVERSE, z)
+        times = [self.t1 if c == 1 else self.t0 + float(c) * self.h for c in NODES]
+        return [(self.sign * t, self.y0 + z[i], rates[i] * (self.sign / self.h)) for i, t in enumerate(times)]
+
+    def residuals(self, z: Float[Array, "3 n"]) -> list[Float[Array, " n"]]:
+        """F at the stages."""
+        return [self.pencil.residual(*stage) for stage in self.stages(z)]
+
+    def jacobians(self, t: Any, y: Any, yd: Any) -> tuple[Any, Any]:
+        """∂F/∂y and ∂F/∂(dy/dτ) for the loop's own time τ = ± t."""
+        j, m = self.pencil.jacobians(t, y, yd)
+        return j, self.sign * m
+
+    def factor(self, jacobians: Any) -> tuple[Any, Float[Array, ""]]:
+        """The factors of γ/h M + J and (α + iβ)/h M + J, and the smallest pivot."""
+        j, m = jacobians
+        real, pivot = self.pencil.factor(j, m, GAMMA / self.h, self.h)
+        both, other = self.pencil.factor(j, m, lax.complex(ALPHA / self.h, BETA / self.h), self.h)
+        return (real, both), jnp.minimum(pivot, other)
+
+    def correction(self, factors: Any, z: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+        """Δz of simplified Newton, decoupled into a real and a complex system."""
+        real, both = factors
+        first, second, third = _combined(BACK, self.residuals(z))
+        w = self.pencil.solve(real, first)
+        v = self.pencil.solve(both, lax.complex(second, third))
+        return -jnp.stack(_combined(TRANSFORM, [w, jnp.real(v), jnp.imag(v)]))
+
+
+class _Newton(NamedTuple):
+    z: Any
+    count: Any
+    last: Any
+    eta: Any
+    theta: Any
+    converged: Any
+    diverged: Any
+
+
+class RadauIIA5(diffrax.AbstractAdaptiveSolver):
+    """The Radau IIA method with three stages: order 5, stiffly accurate, L-stable, for 0 = F(t, y, ẏ) of index 0 to 3.
+
+        0 = F(t₀ + cᵢ h, Yᵢ, Kᵢ),   Yᵢ = y₀ + h Σ aᵢⱼ Kⱼ,   y₁ = Y₃.
+
+    Simplified Newton on zᵢ = Yᵢ − y₀, decoupled into a real and a complex system; the Jacobians and their factors are kept
+    while they serve. The error estimate is that of the embedded formula of order 3, filtered by (γ/h ∂F/∂ẏ + ∂F/∂y)⁻¹;
+    errors of variables of index k count with h^(k−1). Orders: 5 for ODEs and index 1; for index 2, 5 for the
+    differential variables and 3 for the algebraic ones; for index 3, 3 for the positions and velocities, 2 and 1 for what
+    follows them. Constraints of the form hold at the end of each step to the tolerance of Newton's method.
+
+    **Arguments**
+
+    - `rtol`, `atol`: the tolerances that Newton's method is fitted to; by default those of the step-size controller, and
+      round-off for fixed steps.
+
+    Source: E. Hairer, G. Wanner, *Solving Ordinary Differential Equations II*, sections IV.8 and VII.4 and the program
+    RADAU5; E. Hairer, C. Lubich, M. Roche, *The Numerical Solution of Differential-Algebraic Systems by Runge–Kutta
+    Methods*, table 2.3, for the orders.
+    """
+
+    rtol: Any = None
+    atol: Any = None
+
+    term_structure = diffrax.ODETerm
+    interpolation_cls = CollocationPolynomial
+
+    def order(self, terms: Any) -> int:
+        return 5
+
+    def error_order(self, terms: Any) -> int:
+        return 4
+
+    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+        return terms.vf(t0, y0, args)
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> _State:
+        sign = clock(terms, t0, t1)
+        zero = jnp.zeros((), y0.dtype)
+        step = _Step(args, sign, t0, t1, y0)
+        unused = jax.eval_shape(lambda: (j := step.jacobians(t0, y0, y0), step.factor(j)[0]))
+        jacobians, factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), unused)
+        rates = constant(args.rates(sign * t0, y0))
+        return _State(jnp.zeros((3, y0.size), y0.dtype), zero, rates, jacobians, factors, zero, jnp.asarray(True), zero + 1)
+
+    def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: _State, made_jump: Any) -> Any:
+        state = solver_state._replace(
+            refresh=solver_state.refresh | made_jump, h=jnp.where(made_jump, 0, solver_state.h)
+        )
+        step = _Step(args, clock(terms, t0, t1), t0, t1, y0)
+        tol = tolerances(self.rtol, self.atol, y0.dtype)
+        # The unknowns of a stage are interleaved, so that a band stays one.
+        apart = lambda z: z.reshape(-1, 3).T
+        flat, (newton, jacobians, factors, pivot) = implicit_root(
+            lambda z, params: jnp.stack(params[0].residuals(apart(z)), 1).reshape(-1),
+            lambda params: _solve(*params),
+            (step, constant(state), tol),
+            linear_solve=_linear_solve,
+            jacobian=lambda z, params: _coupled(params[0], apart(z)),
+        )
+        z = apart(flat)
+        y1 = y0 + z[2]
+        error = _error(*constant((step, factors[0], z)), tol)
+        scaled = error * args.weights(step.h)
+        failure = of_step(newton.converged, pivot, y0.size, tol.norm(scaled, y0, y1))
+        y1, scaled, result = at_the_floor(failure, t0, t1, y0, y1, scaled)
+        rates = _combined(INVERSE, z)[2] * (step.sign / step.h)
+        slow = (newton.theta > FAST) & (newton.count > 1)
+        new = _State(z, step.h, rates, jacobians, factors, step.h, slow, newton.eta)
+        return y1, scaled, {"y0": y0, "z": z}, constant(new), result
+
+
+def _predicted(state: _State, h: Any) -> Float[Array, "3 n"]:
+    """The stages on the last step's polynomial; 0 without one."""
+    ratio = h / jnp.where(state.h == 0, 1, state.h)
+    ahead = jnp.stack([_along(state.z, 1 + float(c) * ratio) - state.z[2] for c in NODES])
+    return jnp.where(state.h == 0, 0, ahead)
+
+
+def _solve(step: _Step, state: _State, tol: Tolerances) -> Any:
+    """The stages, and how they were found: with the Jacobians at hand first, with new ones where these fail."""
+    h, start = step.h, _predicted(state, step.h)
+    scale = step.pencil.weights(h) / tol.scale(step.y0)
+
+    def attempt(carry: Any) -> Any:
+        tries, fresh, _, jacobians, factors, _ = carry
+        renew = (tries > 0) | state.refresh
+        evaluate = lambda: step.jacobians(step.sign * step.t0, step.y0, state.rates)
+        jacobians = lax.cond(renew, evaluate, lambda: jacobians)
+        infinite = jnp.full_like(h, jnp.inf)
+        factors, pivot = lax.cond(
+            renew | (h != state.factored), lambda: step.factor(jacobians), lambda: (factors, infinite)
+        )
+        return tries + 1, fresh | renew, _newton(step, factors, start, scale, state.eta, tol), jacobians, factors, pivot
+
+    def again(carry: Any) -> Any:
+        tries, fresh, newton, *_ = carry
+        return (tries == 0) | (~newton.converged & ~fresh)
+
+    none = _Newton(start, 0, h, state.eta, h, jnp.asarray(False), jnp.asarray(False))
+    first = (0, jnp.asarray(False), none, state.jacobians, state.factors, h)
+    _, _, newton, jacobians, factors, pivot = lax.while_loop(again, attempt, first)
+    return newton.z.T.reshape(-1), (newton._replace(z=None), jacobians, factors, pivot)
+
+
+def _newton(step: _Step, factors: Any, start: Any, scale: Any, eta: Any, tol: Tolerances) -> _Newton:
+    """Simplified Newton until what remains, θ/(1 − θ) ‖Δz‖, is small beside the tolerance (IV.8)."""
+    epsilon = jnp.finfo(start.dtype).eps
+
+    def unfinished(s: _Newton) -> Any:
+        return ~s.converged & ~s.diverged & (s.count < NEWTON_STEPS)
+
+    def correct(s: _Newton) -> _Newton:
+        dz = step.correction(factors, s.z)
+        size = rms_norm(dz * scale)
+        theta = size / jnp.maximum(s.last, jnp.finfo(start.dtype).tiny)
+        first = s.count == 0
+        eta = jnp.where(first, jnp.maximum(s.eta, epsilon) ** 0.8, theta / jnp.maximum(1 - theta, epsilon))
+        remaining = NEWTON_STEPS - 1 - s.count
+        hopeless = (theta >= 1) | (eta * size * theta**remaining > tol.newton)
+        # A correction that does not shrink any more but is small is round-off.
+        converged = (eta * size <= tol.newton) & (first | (theta < 1)) | (size <= 0.1 * tol.newton)
+        diverged = ~jnp.isfinite(size) | (~first & hopeless & ~converged)
+        theta = jnp.where(first, 0, theta)
+        return _Newton(s.z + dz, s.count + 1, size, eta, theta, converged & jnp.isfinite(size), diverged)
+
+    no = jnp.asarray(False)
+    zero = jnp.zeros((), start.dtype)
+    return lax.while_loop(unfinished, correct, _Newton(start, 0, zero, eta, zero, no, no))
+
+
+def _error(step: _Step, factor: Any, z: Any, tol: Tolerances) -> Float[Array, " n"]:
+    """−(γ/h M + J)⁻¹ F(t₀, y₀, −Σ eᵢ zᵢ/h), once more from y₀ + error where that is large (eqs. IV.8.19, IV.8.20)."""
+    rate = sum(float(e) * z[i] for i, e in enumerate(ERROR)) * (-step.sign / step.h)
+    estimate = lambda y: -step.pencil.solve(factor, step.pencil.residual(step.sign * step.t0, y, rate))
+    error = estimate(step.y0)
+    size = tol.norm(error * step.pencil.weights(step.h), step.y0, step.y0 + z[2])
+    return lax.cond(size < 1, lambda: error, lambda: estimate(step.y0 + error))
+
+
+def _coupled(step: _Step, z: Float[Array, "3 n"]) -> Any:
+    """The Jacobian of all stages at the solution, in the storage of their unknowns interleaved."""
+    found = [step.jacobians(*stage) for stage in step.stages(z)]
+    storage, matrix = step.pencil.storage.coupled(
+        [j for j, _ in found], [m for _, m in found], jnp.asarray(INVERSE, z.dtype) / step.h
+    )
+    return storage, matrix, jnp.repeat(step.pencil.column_scale(step.h), 3)
+
+
+def _linear_solve(jacobian: Any, b: Float[Array, " 3n"]) -> Float[Array, " 3n"]:
+    storage, matrix, scale = jacobian
+    factors, _ = storage.factor(storage.scale_columns(matrix, scale))
+    return scale * storage.solve(factors, b)

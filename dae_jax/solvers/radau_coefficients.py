@@ -1,0 +1,31 @@
+"""The Radau IIA method with three stages: its coefficients, from the nodes.
+
+Source: E. Hairer, G. Wanner, *Solving Ordinary Differential Equations II*, table IV.5.6 and section IV.8.
+"""
+
+import numpy as np
+
+
+ROOT = 6**0.5
+NODES = np.array([(4 - ROOT) / 10, (4 + ROOT) / 10, 1.0])
+_POWERS = NODES[:, None] ** np.arange(1, 4)
+
+# z(s) = Σₖ s^(k+1) (POLYNOMIAL z)ₖ takes the values zᵢ at the nodes and 0 at 0.
+POLYNOMIAL = np.linalg.inv(_POWERS)
+
+# A: ∫₀^cᵢ of the Lagrange polynomials of the nodes.
+_LAGRANGE = np.linalg.inv(NODES[:, None] ** np.arange(3))
+TABLEAU = (_POWERS / np.arange(1, 4)) @ _LAGRANGE
+INVERSE = np.linalg.inv(TABLEAU)
+
+# T⁻¹ A⁻¹ T has the blocks γ and [[α, −β], [β, α]].
+_VALUES, _VECTORS = np.linalg.eig(INVERSE)
+_REAL = int(np.argmin(np.abs(_VALUES.imag)))
+_COMPLEX = int(np.argmin(_VALUES.imag))
+GAMMA = float(_VALUES[_REAL].real)
+ALPHA, BETA = float(_VALUES[_COMPLEX].real), float(-_VALUES[_COMPLEX].imag)
+TRANSFORM = np.stack([_VECTORS[:, _REAL].real, _VECTORS[:, _COMPLEX].real, _VECTORS[:, _COMPLEX].imag], 1)
+BACK = np.linalg.inv(TRANSFORM)
+
+# The embedded formula of order 3, ŷ₁ − y₁ = γ₀ (h ẏ₀ + Σ eᵢ zᵢ) with γ₀ = 1/γ (eq. IV.8.19).
+ERROR = np.array([-(13 + 7 * ROOT), -13 + 7 * ROOT, -1.0]) / 3

@@ -1,0 +1,92 @@
+"""What the solvers of residuals have in common: tolerances, and what becomes of a step that failed."""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from ..linalg import rms_norm, roundoff
+
+
+class Tolerances(NamedTuple):
+    """`rtol`, `atol`; `newton`: what Newton's method may leave, as a part of the tolerance."""
+
+    rtol: Any
+    atol: Any
+    newton: Any
+
+    def scale(self, *ys: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The error that is allowed in each variable."""
+        largest = jnp.abs(ys[0])
+        for y in ys[1:]:
+            largest = jnp.maximum(largest, jnp.abs(y))
+        return self.atol + self.rtol * largest
+
+    def norm(self, error: Any, *ys: Any) -> Float[Array, ""]:
+        """The size of an error; 1 is allowed."""
+        return rms_norm(error / self.scale(*ys))
+
+
+def tolerances(rtol: Any, atol: Any, dtype: Any) -> Tolerances:
+    """Fitted to those of the step-size control, or to round-off for fixed steps, where they are `None`.
+
+    Source: E. Hairer, G. Wanner, *Solving Ordinary Differential Equations II*, the program RADAU5, for `newton`.
+    """
+    epsilon = float(jnp.finfo(dtype).eps)
+    rtol = epsilon ** (2 / 3) if rtol is None else rtol
+    atol = epsilon ** (2 / 3) if atol is None else atol
+    largest = jnp.maximum(jnp.max(jnp.asarray(rtol, dtype)), epsilon)
+    newton = jnp.maximum(10 * epsilon / largest, jnp.minimum(0.03, jnp.sqrt(largest)))
+    return lax.stop_gradient(Tolerances(jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype), newton))
+
+
+class Failure(NamedTuple):
+    """Whether a step came to nothing: `found` is false where Newton's method did not converge, `singular` says that the
+    iteration matrix is why; `accurate` is false where the error is too large.
+    """
+
+    found: Any
+    singular: Any
+    accurate: Any
+
+
+def of_step(found: Any, pivot: Any, size: int, error: Any) -> Failure:
+    """What went wrong, by the smallest pivot of the iteration matrix and the scaled error."""
+    return Failure(found, ~(pivot > size * roundoff(pivot.dtype)), error < 1)
+
+
+def at_the_floor(failure: Failure, t0: Any, t1: Any, y0: Any, y1: Any, error: Any) -> tuple[Any, Any, diffrax.RESULTS]:
+    """(y₁, error, result) of a step. One that came to nothing has an infinite error, so that a smaller one is tried; where
+    time resolves no smaller one, the error is 0, y₁ = y₀, and the result tells an adaptive solve why it ends here.
+    """
+    codes = diffrax.RESULTS
+    resolution = 16 * jnp.finfo(t0.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+    smallest = t1 - t0 <= jnp.maximum(resolution, jnp.finfo(t0.dtype).tiny ** 0.75)
+    result = codes.where(failure.singular, codes.singular, codes.nonlinear_divergence)
+    result = codes.where(failure.found, codes.successful, result)
+    result = codes.where(failure.found & ~failure.accurate & smallest, codes.dt_min_reached, result)
+    ended = smallest & ~(failure.found & failure.accurate)
+    y1 = jnp.where(ended, y0, jnp.where(failure.found, y1, jnp.nan))
+    error = jnp.where(ended, 0, jnp.where(failure.found, error, jnp.inf))
+    return y1, error, result
+
+
+def constant(tree: Any) -> Any:
+    """A pytree whose arrays have no derivative."""
+    return jax.tree.map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
+
+
+def first_step(pencil: Any, solver: Any, t0: Any, t1: Any, y0: Float[Array, " n"]) -> Any:
+    """The size of the first step: no variable moves by more than half its tolerance in it.
+
+    Source: K. E. Brenan, S. L. Campbell, L. R. Petzold, *Numerical Solution of Initial-Value Problems in
+    Differential-Algebraic Equations*, section 5.2.4.
+    """
+    span = t1 - t0
+    tol = tolerances(solver.rtol, solver.atol, y0.dtype)
+    speed = tol.norm(pencil.rates(t0, y0), y0)
+    return lax.stop_gradient(jnp.sign(span) * jnp.minimum(1e-3 * jnp.abs(span), 0.5 / jnp.maximum(speed, 1e-30)))
