@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Inexact, Int
 
 from .constraints import at_one_instant
 from .linalg.dense import LOOPED
-from .linalg.storage import Banded, Dense, Storage
+from .linalg.storage import Banded, Dense, Storage, row_scale
 from .residual import ResidualForm
 from .structure import (
     StructurallySingular,
@@ -135,21 +135,16 @@ class Pencil(eqx.Module):
         return scale * self.storage.solve(inner, b)
 
     def rates(self, t: Any, y: Float[Array, " n"]) -> Float[Array, " n"]:
-        """ẏ with F(t, y, ẏ) = 0 where y is consistent; 0 for variables whose derivative does not occur.
-
-        Newton's method with M + ε J in place of the singular M, at an ε far below the time scales of J: an implicit Euler
-        step of that size.
+        """ẏ with F(t, y, ẏ) = 0 where y is consistent, else with the least F; 0 for variables whose derivative does not
+        occur. Gauss–Newton's method from 0.
         """
-        yd = jnp.zeros_like(y)
-        for _ in range(3):
-            j, m = self.jacobians(t, y, yd)
-            largest = lambda x: jnp.max(jnp.abs(x))
-            step = jnp.finfo(y.dtype).eps ** 0.5 * largest(m) / jnp.maximum(largest(j), jnp.finfo(y.dtype).tiny)
-            step = jnp.where((step > 0) & (step < 1), step, jnp.finfo(y.dtype).eps ** 0.5)
-            factors, _ = self.factor(j, m, 1 / step, step)
-            delta = self.solve(factors, self.residual(t, y, yd)) / step
-            yd = jnp.where(self.outline.differential, yd - delta, 0)
-        return yd
+
+        def improve(_: Any, yd: Any) -> Any:
+            _, m = self.jacobians(t, y, yd)
+            scale = row_scale(m)
+            return yd - self.storage.least_squares(m * self._stored(scale), scale * self.residual(t, y, yd))
+
+        return jax.lax.fori_loop(0, GAUSS_NEWTON, improve, jnp.zeros_like(y))
 
     def weights(self, h: Any) -> Float[Array, " n"]:
         """h^(k−1) for a variable of index k > 1: how much of its error counts.

@@ -26,7 +26,7 @@ class Dense:
 
     def factor(self, a: Inexact[Array, "n n"]) -> tuple[Any, Float[Array, ""]]:
         """The factors, and the smallest pivot relative to the entries of its row: round-off where A is singular."""
-        scale = _row_scale(a)
+        scale = row_scale(a)
         if self.size <= LOOPED:
             inverse, smallest = _inverse(a * scale[:, None])
             return inverse * scale, smallest
@@ -48,6 +48,13 @@ class Dense:
     def scale_columns(self, a: Inexact[Array, "n n"], scale: Inexact[Array, " n"]) -> Inexact[Array, "n n"]:
         """A diag(scale)."""
         return a * scale
+
+    def least_squares(self, a: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:
+        """About the least x that makes |A x − b| least, for a singular A; repeat with what remains of b."""
+        n = self.size
+        regularised = jnp.sum(a[:, :, None] * a[:, None, :], 0) + _cut(a) * jnp.eye(n, dtype=a.dtype)
+        factors, _ = self.factor(regularised)
+        return self.solve(factors, jnp.sum(a * b[:, None], 0))
 
     def coupled(
         self, parts: list[Inexact[Array, "n n"]], others: list[Inexact[Array, "n n"]], weights: Float[Array, "s s"]
@@ -91,7 +98,7 @@ class Banded:
 
     def factor(self, a: Inexact[Array, "n width"]) -> tuple[Any, Float[Array, ""]]:
         """The factors, by Gaussian elimination with partial pivoting in a window that moves down the band."""
-        scale = _row_scale(a)
+        scale = row_scale(a)
         lower, reach = self.lower, self.lower + self.upper + 1
         if not lower:
             upper = (a * scale[:, None], scale)
@@ -152,6 +159,27 @@ class Banded:
         """A diag(scale)."""
         return a * scale[self.positions()[1]]
 
+    def least_squares(self, a: Float[Array, "n width"], b: Float[Array, " n"]) -> Float[Array, " n"]:
+        """About the least x that makes |A x − b| least, for a singular A; repeat with what remains of b.
+
+        From r + A x = b and Aᵀ r = ε x, which has a band too.
+        """
+        n, reach = self.size, max(self.lower, self.upper)
+        offsets = np.arange(-reach, reach + 1)
+        wide = jnp.pad(a, ((0, 0), (reach - self.lower, reach - self.upper)))
+        # Entry (i, i + k) of Aᵀ is entry (i + k, i) of A.
+        rows = np.arange(n)[:, None] + offsets
+        inside = (rows >= 0) & (rows < n)
+        transposed = jnp.where(inside, wide[np.clip(rows, 0, n - 1), reach - offsets], 0)
+        diagonal = jnp.broadcast_to(jnp.asarray(offsets == 0, a.dtype), wide.shape)
+        in_place = Banded(np.arange(n), np.arange(n), reach, reach)
+        both, matrix = in_place.coupled(
+            [diagonal, -_cut(a) * diagonal], [wide, transposed], jnp.asarray([[0.0, 1.0], [1.0, 0.0]], a.dtype)
+        )
+        factors, _ = both.factor(matrix)
+        right = jnp.stack([b[self.rows], jnp.zeros_like(b)], 1).reshape(-1)
+        return both.solve(factors, right)[1::2][np.argsort(self.columns)]
+
     def coupled(
         self, parts: list[Inexact[Array, "n width"]], others: list[Inexact[Array, "n width"]], weights: Float[Array, "s s"]
     ) -> tuple["Banded", Inexact[Array, "sn width"]]:
@@ -169,7 +197,14 @@ class Banded:
 Storage = Dense | Banded
 
 
-def _row_scale(a: Inexact[Array, "n k"]) -> Float[Array, " n"]:
+def _cut(a: Float[Array, "n k"]) -> Float[Array, ""]:
+    """Squared singular values of A below this count as 0."""
+    largest = jnp.max(jnp.sum(a * a, 1))
+    return 100 * jnp.finfo(a.dtype).eps * jnp.where(largest > 0, largest, 1)
+
+
+def row_scale(a: Inexact[Array, "n k"]) -> Float[Array, " n"]:
+    """One over the largest entry of each row, 1 for a row of zeros."""
     largest = jnp.max(_size(a), 1)
     return 1 / jnp.where(largest > 0, largest, 1)
 
