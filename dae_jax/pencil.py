@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Inexact, Int
 
 from .constraints import at_one_instant
 from .linalg.dense import LOOPED
-from .linalg.storage import Banded, Dense, Storage, row_scale
+from .linalg.storage import Banded, Dense, Storage
 from .residual import ResidualForm
 from .structure import (
     StructurallySingular,
@@ -25,6 +25,9 @@ from .structure import (
     signature,
     variable_indices,
 )
+
+
+GAUSS_NEWTON = 5
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -141,8 +144,7 @@ class Pencil(eqx.Module):
 
         def improve(_: Any, yd: Any) -> Any:
             _, m = self.jacobians(t, y, yd)
-            scale = row_scale(m)
-            return yd - self.storage.least_squares(m * self._stored(scale), scale * self.residual(t, y, yd))
+            return yd - self.storage.least_squares(m, self.residual(t, y, yd))
 
         return jax.lax.fori_loop(0, GAUSS_NEWTON, improve, jnp.zeros_like(y))
 

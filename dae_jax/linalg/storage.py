@@ -26,7 +26,7 @@ class Dense:
 
     def factor(self, a: Inexact[Array, "n n"]) -> tuple[Any, Float[Array, ""]]:
         """The factors, and the smallest pivot relative to the entries of its row: round-off where A is singular."""
-        scale = row_scale(a)
+        scale = _row_scale(a)
         if self.size <= LOOPED:
             inverse, smallest = _inverse(a * scale[:, None])
             return inverse * scale, smallest
@@ -51,10 +51,11 @@ class Dense:
 
     def least_squares(self, a: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:
         """About the least x that makes |A x − b| least, for a singular A; repeat with what remains of b."""
-        n = self.size
-        regularised = jnp.sum(a[:, :, None] * a[:, None, :], 0) + _cut(a) * jnp.eye(n, dtype=a.dtype)
-        factors, _ = self.factor(regularised)
-        return self.solve(factors, jnp.sum(a * b[:, None], 0))
+        scale = _row_scale(a)[:, None]
+        a = a * scale
+        product = jnp.sum(a[:, :, None] * a[:, None, :], 0) if self.size <= LOOPED else jnp.dot(a.T, a)
+        factors, _ = self.factor(product + _cut(a) * jnp.eye(self.size, dtype=a.dtype))
+        return self.solve(factors, jnp.sum(a * (scale * b[:, None]), 0))
 
     def coupled(
         self, parts: list[Inexact[Array, "n n"]], others: list[Inexact[Array, "n n"]], weights: Float[Array, "s s"]
@@ -98,7 +99,7 @@ class Banded:
 
     def factor(self, a: Inexact[Array, "n width"]) -> tuple[Any, Float[Array, ""]]:
         """The factors, by Gaussian elimination with partial pivoting in a window that moves down the band."""
-        scale = row_scale(a)
+        scale = _row_scale(a)
         lower, reach = self.lower, self.lower + self.upper + 1
         if not lower:
             upper = (a * scale[:, None], scale)
@@ -165,6 +166,8 @@ class Banded:
         From r + A x = b and Aᵀ r = ε x, which has a band too.
         """
         n, reach = self.size, max(self.lower, self.upper)
+        scale = _row_scale(a)
+        a = a * scale[:, None]
         offsets = np.arange(-reach, reach + 1)
         wide = jnp.pad(a, ((0, 0), (reach - self.lower, reach - self.upper)))
         # Entry (i, i + k) of Aᵀ is entry (i + k, i) of A.
@@ -177,7 +180,7 @@ class Banded:
             [diagonal, -_cut(a) * diagonal], [wide, transposed], jnp.asarray([[0.0, 1.0], [1.0, 0.0]], a.dtype)
         )
         factors, _ = both.factor(matrix)
-        right = jnp.stack([b[self.rows], jnp.zeros_like(b)], 1).reshape(-1)
+        right = jnp.stack([b[self.rows] * scale, jnp.zeros_like(b)], 1).reshape(-1)
         return both.solve(factors, right)[1::2][np.argsort(self.columns)]
 
     def coupled(
@@ -203,8 +206,7 @@ def _cut(a: Float[Array, "n k"]) -> Float[Array, ""]:
     return 100 * jnp.finfo(a.dtype).eps * jnp.where(largest > 0, largest, 1)
 
 
-def row_scale(a: Inexact[Array, "n k"]) -> Float[Array, " n"]:
-    """One over the largest entry of each row, 1 for a row of zeros."""
+def _row_scale(a: Inexact[Array, "n k"]) -> Float[Array, " n"]:
     largest = jnp.max(_size(a), 1)
     return 1 / jnp.where(largest > 0, largest, 1)
 

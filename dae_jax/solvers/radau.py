@@ -14,7 +14,6 @@ from .radau_coefficients import ALPHA, BACK, BETA, ERROR, GAMMA, INVERSE, NODES,
 from .residual_steps import Tolerances, at_the_floor, constant, of_step, tolerances
 
 
-NEWTON_STEPS = 10
 # The Jacobian is kept for the next step while Newton's method contracts faster than this.
 FAST = 1e-2
 
@@ -125,8 +124,7 @@ class RadauIIA5(diffrax.AbstractAdaptiveSolver):
     Simplified Newton on zᵢ = Yᵢ − y₀, decoupled into a real and a complex system; the Jacobians and their factors are kept
     while they serve. The error estimate is that of the embedded formula of order 3, filtered by (γ/h ∂F/∂ẏ + ∂F/∂y)⁻¹;
     errors of variables of index k count with h^(k−1). Orders: 5 for ODEs and index 1; for index 2, 5 for the
-    differential variables and 3 for the algebraic ones; for index 3, 3 for the positions and velocities, 2 and 1 for what
-    follows them. Constraints of the form hold at the end of each step to the tolerance of Newton's method.
+    differential variables and 3 for the algebraic ones; for index 3, 5, 3 and 2 for variables of index 1, 2 and 3. Constraints of the form hold at the end of each step to the tolerance of Newton's method.
 
     **Arguments**
 
@@ -227,7 +225,7 @@ def _newton(step: _Step, factors: Any, start: Any, scale: Any, eta: Any, tol: To
     epsilon = jnp.finfo(start.dtype).eps
 
     def unfinished(s: _Newton) -> Any:
-        return ~s.converged & ~s.diverged & (s.count < NEWTON_STEPS)
+        return ~s.converged & ~s.diverged & (s.count < tol.corrections)
 
     def correct(s: _Newton) -> _Newton:
         dz = step.correction(factors, s.z)
@@ -235,11 +233,11 @@ def _newton(step: _Step, factors: Any, start: Any, scale: Any, eta: Any, tol: To
         theta = size / jnp.maximum(s.last, jnp.finfo(start.dtype).tiny)
         first = s.count == 0
         eta = jnp.where(first, jnp.maximum(s.eta, epsilon) ** 0.8, theta / jnp.maximum(1 - theta, epsilon))
-        remaining = NEWTON_STEPS - 1 - s.count
+        remaining = tol.corrections - 1 - s.count
         hopeless = (theta >= 1) | (eta * size * theta**remaining > tol.newton)
         # A correction that does not shrink any more but is small is round-off.
-        converged = (eta * size <= tol.newton) & (first | (theta < 1)) | (size <= 0.1 * tol.newton)
-        diverged = ~jnp.isfinite(size) | (~first & hopeless & ~converged)
+        converged = (eta * size <= tol.newton) & (first | (theta < 1)) | (size <= tol.roundoff)
+        diverged = ~jnp.isfinite(size) | (~first & hopeless & ~converged & (not tol.patient))
         theta = jnp.where(first, 0, theta)
         return _Newton(s.z + dz, s.count + 1, size, eta, theta, converged & jnp.isfinite(size), diverged)
 

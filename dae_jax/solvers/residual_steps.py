@@ -13,11 +13,17 @@ from ..linalg import rms_norm, roundoff
 
 
 class Tolerances(NamedTuple):
-    """`rtol`, `atol`; `newton`: what Newton's method may leave, as a part of the tolerance."""
+    """`rtol`, `atol`; what Newton's method may leave, as a part of these: `newton`, and `roundoff` where it gets no
+    further, in at most `corrections`;
+    `patient` where a step that fails is not tried again with a smaller size.
+    """
 
     rtol: Any
     atol: Any
     newton: Any
+    roundoff: Any
+    corrections: int
+    patient: bool
 
     def scale(self, *ys: Float[Array, " n"]) -> Float[Array, " n"]:
         """The error that is allowed in each variable."""
@@ -37,11 +43,12 @@ def tolerances(rtol: Any, atol: Any, dtype: Any) -> Tolerances:
     Source: E. Hairer, G. Wanner, *Solving Ordinary Differential Equations II*, the program RADAU5, for `newton`.
     """
     epsilon = float(jnp.finfo(dtype).eps)
-    rtol = epsilon ** (2 / 3) if rtol is None else rtol
-    atol = epsilon ** (2 / 3) if atol is None else atol
+    patient = rtol is None
+    rtol, atol = (epsilon ** (2 / 3) if x is None else x for x in (rtol, atol))
     largest = jnp.maximum(jnp.max(jnp.asarray(rtol, dtype)), epsilon)
     newton = jnp.maximum(10 * epsilon / largest, jnp.minimum(0.03, jnp.sqrt(largest)))
-    return lax.stop_gradient(Tolerances(jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype), newton))
+    roundoff = jnp.maximum(100 * epsilon / largest, newton / 10)
+    return Tolerances(*lax.stop_gradient((jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype), newton, roundoff)), 50 if patient else 10, patient)
 
 
 class Failure(NamedTuple):
