@@ -53,7 +53,12 @@ class Dense:
         """About the least x that makes |A x − b| least, for a singular A; repeat with what remains of b."""
         scale = _row_scale(a)[:, None]
         a = a * scale
-        product = jnp.sum(a[:, :, None] * a[:, None, :], 0) if self.size <= LOOPED else jnp.dot(a.T, a)
+        if self.size <= LOOPED:
+            # XLA makes a product out of a sum of this size, which is a library call.
+            outer = lambda i, s: s + a[i][:, None] * a[i]
+            product = lax.fori_loop(0, self.size, outer, jnp.zeros_like(a))
+        else:
+            product = jnp.dot(a.T, a, precision=lax.Precision.HIGHEST)
         factors, _ = self.factor(product + _cut(a) * jnp.eye(self.size, dtype=a.dtype))
         return self.solve(factors, jnp.sum(a * (scale * b[:, None]), 0))
 
