@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .constraints import MechanicalODE, at_one_instant
-from .normals import mass_solve
 from .structure.layout import Layout
 from .systems import ConstrainedSystem, ImplicitDAE, SemiExplicitDAE, System
 
@@ -22,7 +21,7 @@ class ResidualForm(eqx.Module):
 
         index-3:  0 = q̇ − v,            0 = M v̇ − f + Aᵀλ,   0 = (g, h);
         index-2:  0 = q̇ − v,            0 = M v̇ − f + Aᵀλ,   0 = (G v + g_t, h);
-        GGL:      0 = q̇ − v + M⁻¹Gᵀη,   0 = M v̇ − f + Aᵀλ,   0 = (G v + g_t, h),   0 = g,
+        GGL:      0 = M (q̇ − v) + Gᵀη,  0 = M v̇ − f + Aᵀλ,   0 = (G v + g_t, h),   0 = g,
 
     for a `SemiExplicitDAE` y = (x, z) and F = (ẋ − f, g).
 
@@ -108,16 +107,16 @@ class ResidualForm(eqx.Module):
         n, m, p = ode.layout.size, ode.holonomic, ode.nonholonomic
         q, v, multipliers = y[:n], y[n : 2 * n], y[2 * n : 2 * n + m + p]
         a, mass = ode.constraint_jacobian(t, q, v), ode.mass(q)
-        inertia = yd[n : 2 * n] if mass is None else mass * yd[n : 2 * n] if mass.ndim < 2 else mass @ yd[n : 2 * n]
-        momentum = inertia - ode.force(t, q, v) + multipliers @ a
+        weighted = lambda x: x if mass is None else mass * x if mass.ndim < 2 else mass @ x
+        momentum = weighted(yd[n : 2 * n]) - ode.force(t, q, v) + multipliers @ a
         velocity = ode.velocity_constraint(t, q, v)
         kinematics = yd[:n] - v
         if self.form == "index-3":
             return jnp.concatenate([kinematics, momentum, ode.constraint(t, q), velocity[m:]])
         if self.form == "index-2":
             return jnp.concatenate([kinematics, momentum, velocity])
-        normals = mass_solve(mass, a[:m].T)
-        return jnp.concatenate([kinematics + normals @ y[2 * n + m + p :], momentum, velocity, ode.constraint(t, q)])
+        stabilised = weighted(kinematics) + y[2 * n + m + p :] @ a[:m]
+        return jnp.concatenate([stabilised, momentum, velocity, ode.constraint(t, q)])
 
 
 def _names(stem: str, out: Any) -> tuple[str, ...]:
