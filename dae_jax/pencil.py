@@ -65,7 +65,7 @@ class Pencil(eqx.Module):
     outline: Outline = eqx.field(static=True)
 
     @classmethod
-    def of(cls, form: ResidualForm, t: Any, y: Float[Array, " n"], indices: tuple[int, ...] | None = None) -> "Pencil":
+    def of(cls, form: ResidualForm, y: Float[Array, " n"], indices: tuple[int, ...] | None = None) -> "Pencil":
         """Finds, while tracing, which equation depends on which variable and derivative.
 
         Errors: `ValueError` for a structurally singular system.
@@ -161,7 +161,11 @@ def powers(x: Float[Array, ""], exponents: tuple[int, ...]) -> Float[Array, " n"
     values = [jnp.ones_like(x)]
     for _ in range(max(exponents, default=0)):
         values.append(values[-1] * x)
-    return jnp.stack([values[k] for k in exponents]) if len(exponents) <= LOOPED else jnp.stack(values)[np.array(exponents)]
+    return (
+        jnp.stack([values[k] for k in exponents])
+        if len(exponents) <= LOOPED
+        else jnp.stack(values)[np.array(exponents)]
+    )
 
 
 @functools.lru_cache(maxsize=64)

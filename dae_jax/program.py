@@ -23,7 +23,6 @@ from .solvers import (
     DOP853,
     AbstractManifoldSolver,
     OrthogonalProjection,
-    RadauIIA5,
     TangentSpace,
     first_step,
     unrolled,

@@ -48,7 +48,7 @@ class Residual(AbstractFormulation):
             ode = MechanicalODE.of(system, t, state, args)
             multipliers = ode.multipliers(t, ode.encode(state))
             y = jnp.concatenate([y[: form.layout.size], multipliers, jnp.zeros(form.extra - multipliers.size, y.dtype)])
-        return y, Pencil.of(form, t, y, self.variable_index)
+        return y, Pencil.of(form, y, self.variable_index)
 
     def field(self, t: Any, y: Any, ode: Any) -> Any:
         """NaN: a residual has no ẏ in explicit form."""

@@ -7,7 +7,6 @@ derived by JAX in both modes. The unknowns of a band are reordered inside: vecto
 import dataclasses
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -189,7 +188,10 @@ class Banded:
         return both.solve(factors, right)[1::2][np.argsort(self.columns)]
 
     def coupled(
-        self, parts: list[Inexact[Array, "n width"]], others: list[Inexact[Array, "n width"]], weights: Float[Array, "s s"]
+        self,
+        parts: list[Inexact[Array, "n width"]],
+        others: list[Inexact[Array, "n width"]],
+        weights: Float[Array, "s s"],
     ) -> tuple["Banded", Inexact[Array, "sn width"]]:
         """The matrix of s coupled copies, block (i, j) = δᵢⱼ partsᵢ + weightsᵢⱼ othersᵢ, unknowns of a copy interleaved."""
         s, n = len(parts), self.size

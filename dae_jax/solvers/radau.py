@@ -124,7 +124,8 @@ class RadauIIA5(diffrax.AbstractAdaptiveSolver):
     Simplified Newton on zᵢ = Yᵢ − y₀, decoupled into a real and a complex system; the Jacobians and their factors are kept
     while they serve. The error estimate is that of the embedded formula of order 3, filtered by (γ/h ∂F/∂ẏ + ∂F/∂y)⁻¹;
     errors of variables of index k count with h^(k−1). Orders: 5 for ODEs and index 1; for index 2, 5 for the
-    differential variables and 3 for the algebraic ones; for index 3, 5, 3 and 2 for variables of index 1, 2 and 3. Constraints of the form hold at the end of each step to the tolerance of Newton's method.
+    differential variables and 3 for the algebraic ones; for index 3, 5, 3 and 2 for variables of index 1, 2 and 3.
+    Constraints of the form hold at the end of each step to the tolerance of Newton's method.
 
     **Arguments**
 
@@ -158,7 +159,9 @@ class RadauIIA5(diffrax.AbstractAdaptiveSolver):
         unused = jax.eval_shape(lambda: (j := step.jacobians(t0, y0, y0), step.factor(j)[0]))
         jacobians, factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), unused)
         rates = constant(args.rates(sign * t0, y0))
-        return _State(jnp.zeros((3, y0.size), y0.dtype), zero, rates, jacobians, factors, zero, jnp.asarray(True), zero + 1)
+        return _State(
+            jnp.zeros((3, y0.size), y0.dtype), zero, rates, jacobians, factors, zero, jnp.asarray(True), zero + 1
+        )
 
     def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: _State, made_jump: Any) -> Any:
         state = solver_state._replace(

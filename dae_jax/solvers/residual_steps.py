@@ -48,7 +48,11 @@ def tolerances(rtol: Any, atol: Any, dtype: Any) -> Tolerances:
     largest = jnp.maximum(jnp.max(jnp.asarray(rtol, dtype)), epsilon)
     newton = jnp.maximum(10 * epsilon / largest, jnp.minimum(0.03, jnp.sqrt(largest)))
     roundoff = jnp.maximum(100 * epsilon / largest, newton / 10)
-    return Tolerances(*lax.stop_gradient((jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype), newton, roundoff)), 50 if patient else 10, patient)
+    return Tolerances(
+        *lax.stop_gradient((jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype), newton, roundoff)),
+        50 if patient else 10,
+        patient,
+    )
 
 
 class Failure(NamedTuple):
