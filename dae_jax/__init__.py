@@ -2,7 +2,7 @@
 
 from .analyse import Structure as Structure, analyse as analyse
 from .diagnostics import Drift as Drift, drift as drift, energy as energy, multipliers as multipliers
-from .explain import Plan as Plan, explain as explain
+from .explain import MechanicalPlan as MechanicalPlan, Plan as Plan, ResidualPlan as ResidualPlan, explain as explain
 from .formulations import (
     GGL as GGL,
     AbstractFormulation as AbstractFormulation,

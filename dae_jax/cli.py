@@ -57,7 +57,10 @@ def _compare(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> 
     except ValueError as refusal:
         parser.error(str(refusal))
     rows = [row for row, _ in results]
-    print(f"{scene.name}, {t1:g} s, tolerance {arguments.rtol:g}; error and drifts are the largest over 501 times")
+    print(
+        f"{scene.name}, {t1:g} s, tolerance {arguments.rtol:g}; error and drifts are the largest over 501 times, errors "
+        f"relative where the solution is larger than {scene.scale:g}"
+    )
     print(table(rows))
     solutions = {row.method: sol for row, sol in results if sol is not None}
     folder = arguments.out or Path(f"compare-{arguments.scene}")

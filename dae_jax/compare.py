@@ -1,6 +1,7 @@
 """One scene by every method: the paper's comparison."""
 
 import dataclasses
+import functools
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -13,10 +14,20 @@ import numpy as np
 
 from . import plotting
 from .diagnostics import drift, energy
-from .formulations import AbstractFormulation, Baumgarte, StateSpace
+from .formulations import AbstractFormulation, Baumgarte, Residual, StateSpace
 from .scenes import Scene
 from .solve import daesolve
-from .solvers import DOP853, RATTLE, Gauss4, OrthogonalProjection, SymmetricProjection, TangentSpace, Trapezoid
+from .solvers import (
+    DOP853,
+    RATTLE,
+    Gauss4,
+    OrthogonalProjection,
+    RadauIIA5,
+    SymmetricProjection,
+    TangentSpace,
+    Trapezoid,
+)
+from .systems import ConstrainedSystem, ImplicitDAE
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,6 +41,8 @@ class Method:
 
 def methods(scene: Scene) -> dict[str, Method]:
     """The methods by their command-line names; the state-space form where the scene has a chart."""
+    if not isinstance(scene.system, ConstrainedSystem):
+        return {"radau": Method(RadauIIA5())}
     found = {
         "differentiation": Method(DOP853()),
         "differentiation-fixed": Method(diffrax.Tsit5(), step=0.02),
@@ -41,6 +54,9 @@ def methods(scene: Scene) -> dict[str, Method]:
         "symmetric-gauss4": Method(SymmetricProjection(Gauss4()), step=0.01),
         "tangent-space": Method(TangentSpace(DOP853())),
         "rattle": Method(RATTLE(), step=0.01),
+        "radau-ggl": Method(RadauIIA5()),
+        "radau-index-2": Method(RadauIIA5(), Residual("index-2")),
+        "radau-index-3": Method(RadauIIA5(), Residual("index-3")),
     }
     if scene.chart is not None:
         found["state-space"] = Method(DOP853(), StateSpace(scene.chart))
@@ -64,7 +80,7 @@ class Row:
 
 def solve(scene: Scene, method: Method, times: np.ndarray, rtol: float) -> Any:
     """The scene by one method at the given times."""
-    controller = None if method.step else diffrax.PIDController(rtol=rtol, atol=rtol)
+    controller = None if method.step else diffrax.PIDController(rtol=rtol, atol=scene.scale * rtol)
     return daesolve(
         scene.system, method.solver, 0.0, times[-1], method.step, scene.y0, scene.args,
         formulation=method.formulation, stepsize_controller=controller,
@@ -84,18 +100,16 @@ def measure(scene: Scene, name: str, method: Method, times: np.ndarray, rtol: fl
     except (RuntimeError, TypeError, ValueError) as refusal:
         return Row(name, reason=str(refusal).splitlines()[0]), None
     assert sol is not None
+    median = float(np.median(seconds[1:]))
+    error = scene.error(times, sol.ys)
+    row = Row(name, int(sol.stats["num_steps"]), median, seconds[0] - median, error)
+    if not isinstance(scene.system, ConstrainedSystem):
+        return row, sol
     off = drift(scene.system, sol)
-    within = times <= scene.horizon
-    exact = scene.reference(times[within])
-    error = max(float(np.abs(np.asarray(a)[within] - b).max()) for a, b in zip(sol.ys, exact, strict=True))
-    change = np.nan
+    row = dataclasses.replace(row, position_drift=float(off.position.max()), velocity_drift=float(off.velocity.max()))
     if scene.system.potential is not None:
         total = np.asarray(energy(scene.system, sol))
-        change = float(np.abs(total - total[0]).max())
-    row = Row(
-        name, int(sol.stats["num_steps"]), float(np.median(seconds[1:])), seconds[0] - float(np.median(seconds[1:])),
-        error, float(off.position.max()), float(off.velocity.max()), change,
-    )  # fmt: skip
+        row = dataclasses.replace(row, energy_drift=float(np.abs(total - total[0]).max()))
     return row, sol
 
 
@@ -121,10 +135,9 @@ def table(rows: list[Row]) -> str:
         if r.reason:
             lines.append(f"{r.method:22s}  {r.reason}")
         else:
-            lines.append(
-                f"{r.method:22s}{r.steps:9d}{1e3 * r.run_seconds:10.3f}{r.compile_seconds:11.2f}{r.error:10.1e}"
-                f"{r.position_drift:10.1e}{r.velocity_drift:13.1e}{r.energy_drift:14.1e}"
-            )
+            measured = zip((10, 10, 13, 14), (r.error, r.position_drift, r.velocity_drift, r.energy_drift), strict=True)
+            numbers = "".join(f"{'–' if np.isnan(x) else f'{x:.1e}':>{width}}" for width, x in measured)
+            lines.append(f"{r.method:22s}{r.steps:9d}{1e3 * r.run_seconds:10.3f}{r.compile_seconds:11.2f}{numbers}")
     return "\n".join(lines)
 
 
@@ -132,7 +145,13 @@ def table(rows: list[Row]) -> str:
 
 
 def figures(scene: Scene, solutions: dict[str, Any], rtol: float) -> Iterator[tuple[str, Callable[[], Any]]]:
-    """(file name, how to draw it): the drift of all methods, and the paper's figures where the scene is one of its two."""
+    """(file name, how to draw it): the drift of all methods, and the paper's figures where the scene is one of its two;
+    the solution itself where the scene is no mechanism.
+    """
+    if not isinstance(scene.system, ConstrainedSystem):
+        for name, sol in solutions.items():
+            yield f"solution-{name}", functools.partial(_components, scene, name, sol)
+        return
     curves = {
         name: (np.asarray(sol.ts), np.asarray(drift(scene.system, sol).position)) for name, sol in solutions.items()
     }
@@ -152,6 +171,21 @@ def figures(scene: Scene, solutions: dict[str, Any], rtol: float) -> Iterator[tu
             lambda: _trace(scene, Method(DOP853(), Baumgarte(100.0, 1000.0)), "Baumgarte, α = 100, β = 1000"),
         )
         yield "fig8_state_space", lambda: _trace(scene, Method(DOP853(), StateSpace(scene.chart)), "State-space form")
+
+
+def _components(scene: Scene, name: str, sol: Any) -> Any:
+    curves = {}
+    for letter, part in _parts(scene, sol):
+        for i, component in enumerate(part.reshape(len(part), -1).T):
+            curves[f"{letter}[{i}]"] = (np.asarray(sol.ts), component / max(np.abs(component).max(), 1e-300))
+    return plotting.over_time(curves, "value / largest value", f"{scene.name} by {name}")
+
+
+def _parts(scene: Scene, sol: Any) -> list[tuple[str, np.ndarray]]:
+    """The leaves of a solution, by the letters of the documentation."""
+    system = scene.system
+    letters = "y" if isinstance(system, ImplicitDAE) else "qv" if isinstance(system, ConstrainedSystem) else "xz"
+    return list(zip(letters, map(np.asarray, jax.tree.leaves(sol.ys)), strict=True))
 
 
 def _drift_off(scene: Scene) -> Any:
@@ -200,9 +234,7 @@ def write(scene: Scene, rows: list[Row], solutions: dict[str, Any], rtol: float,
     fields = [f.name for f in dataclasses.fields(Row)]
     lines = [",".join(fields), *(",".join(f'"{getattr(r, f)}"' for f in fields) for r in rows)]
     (folder / "table.csv").write_text("\n".join(lines) + "\n")
-    arrays = {
-        f"{name}_{part}": np.asarray(x) for name, sol in solutions.items() for part, x in zip("qv", sol.ys, strict=True)
-    }
+    arrays = {f"{name}_{letter}": x for name, sol in solutions.items() for letter, x in _parts(scene, sol)}
     np.savez(folder / "solutions.npz", **arrays)
     written = [folder / "table.csv", folder / "solutions.npz"]
     for name, draw in figures(scene, solutions, rtol):

@@ -11,65 +11,106 @@ import numpy as np
 
 from .checks import refuse_bad_start
 from .constraints import MechanicalODE
-from .formulations import AbstractFormulation
+from .formulations import AbstractFormulation, Residual
 from .kernels import equations, hindrances, one_kernel_enabled, without_checks
 from .linalg.semidefinite import LOOPED, UNROLLED
 from .normals import SparseNormals
+from .pencil import Pencil
 from .program import Solve
 from .solve import prepared
 
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """How a system is solved; `print` it.
+    """How a system is solved; `print` it. `explain` gives a `MechanicalPlan` or a `ResidualPlan`.
 
     - `method`: formulation and solver, in words.
-    - `coordinates`, `constraints`, `independent`: counts; `independent` is `None` where the start is traced.
-    - `mass`: "unit", "diagonal" or "matrix", and whether it depends on q.
-    - `constraints_depend_on_time`.
-    - `linear_solver`: how the multipliers are found.
-    - `nonzeros`, `colours`: nonzeros of the constraints' Jacobian, and the directional derivatives that it takes; `None`
-      where it is dense.
-    - `operations`: primitive operations of one evaluation of the field, as it is compiled.
+    - `linear_solver`: how the linear systems of a step are solved.
+    - `operations`: primitive operations of one evaluation of the field or the residual, as it is compiled.
     - `one_kernel`: whether the whole loop is compiled to one kernel; `hindrances`: the primitives that prevent it.
     - `left_out`: what other systems need and this one does not.
     """
 
     method: str
-    coordinates: int
-    constraints: int
-    independent: int | None
-    mass: str
-    constraints_depend_on_time: bool
     linear_solver: str
-    nonzeros: int | None
-    colours: int | None
     operations: int
     one_kernel: bool
     hindrances: tuple[str, ...]
     left_out: tuple[str, ...]
 
     def __str__(self) -> str:
-        independent = self.constraints if self.independent is None else self.independent
-        redundant = "" if independent == self.constraints else f", {independent} of them independent"
         kernel = "yes" if self.one_kernel else "no: " + (", ".join(self.hindrances) or "switched off, or not on a CPU")
-        jacobian = "dense, by forward-mode derivatives"
-        if self.colours is not None:
-            jacobian = f"{self.nonzeros} nonzeros from {self.colours} directional derivatives"
         rows = {
             "method": self.method,
-            "system": f"{self.coordinates} coordinates, {self.constraints} constraints{redundant}",
-            "mass": self.mass,
-            "time": "constraints depend on time"
-            if self.constraints_depend_on_time
-            else "constraints are fixed in time",
-            "constraint Jacobian": jacobian,
-            "multipliers": self.linear_solver,
-            "field": f"{self.operations} operations",
+            **self._found(),
             "one kernel": kernel,
             "left out": "; ".join(self.left_out) or "nothing",
         }
         return "\n".join(f"{name:>20}  {text}" for name, text in rows.items())
+
+    def _found(self) -> dict[str, str]:
+        raise NotImplementedError
+
+
+@dataclasses.dataclass(frozen=True)
+class MechanicalPlan(Plan):
+    """Of the underlying ODE of a mechanism.
+
+    - `coordinates`, `constraints`, `independent`: counts; `independent` is `None` where the start is traced.
+    - `mass`: "unit", "diagonal" or "matrix", and whether it depends on q.
+    - `constraints_depend_on_time`.
+    - `nonzeros`, `colours`: nonzeros of the constraints' Jacobian, and the directional derivatives that it takes; `None`
+      where it is dense.
+    """
+
+    coordinates: int
+    constraints: int
+    independent: int | None
+    mass: str
+    constraints_depend_on_time: bool
+    nonzeros: int | None
+    colours: int | None
+
+    def _found(self) -> dict[str, str]:
+        independent = self.constraints if self.independent is None else self.independent
+        redundant = "" if independent == self.constraints else f", {independent} of them independent"
+        jacobian = "dense, by forward-mode derivatives"
+        if self.colours is not None:
+            jacobian = f"{self.nonzeros} nonzeros from {self.colours} directional derivatives"
+        return {
+            "system": f"{self.coordinates} coordinates, {self.constraints} constraints{redundant}",
+            "mass": self.mass,
+            "time": f"constraints {'depend on' if self.constraints_depend_on_time else 'are fixed in'} time",
+            "constraint Jacobian": jacobian,
+            "multipliers": self.linear_solver,
+            "field": f"{self.operations} operations",
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class ResidualPlan(Plan):
+    """Of 0 = F(t, y, ẏ) as it is written.
+
+    - `unknowns`; `indices`: the index of each, by which its errors are weighted.
+    - `derivatives`: of how many unknowns the derivative occurs.
+    - `colours`: directional derivatives for ∂F/∂y and ∂F/∂ẏ.
+    """
+
+    unknowns: int
+    indices: tuple[int, ...]
+    derivatives: int
+    colours: tuple[int, int]
+
+    def _found(self) -> dict[str, str]:
+        counts = [f"{self.indices.count(k)} of index {k}" for k in sorted(set(self.indices))]
+        by_y, by_rate = self.colours
+        return {
+            "system": f"{self.unknowns} unknowns, derivatives of {self.derivatives} occur",
+            "unknowns": ", ".join(counts),
+            "Jacobians": f"∂F/∂y from {by_y} directional derivatives, ∂F/∂ẏ from {by_rate}",
+            "linear systems": self.linear_solver,
+            "residual": f"{self.operations} operations",
+        }
 
 
 def explain(
@@ -102,24 +143,47 @@ def explain(
     kernel, arrays, _ = solve.kernel(*inputs[1:], rank)
     found = hindrances(jax.make_jaxpr(without_checks(kernel))(arrays))
     enabled = one_kernel_enabled() and jax.default_backend() == "cpu" and solve.derivative() != "any"
+    method = f"{_name(solve.formulation)}, {_name(solver)}"
+    if isinstance(solve.formulation, Residual):
+        y, pencil = solve.formulation.encode(system, t0, y0, args)
+        return _of_residual(pencil, t0, y, method, enabled and not found, found)
     ode = MechanicalODE.of(system, t0, y0, args, rank)
     count = ode.holonomic + ode.nonholonomic
     sparse = ode.linear if isinstance(ode.linear, SparseNormals) else None
     y = ode.encode(y0)
-    return Plan(
-        method=f"{_name(solve.formulation)}, {_name(solver)}",
+    return MechanicalPlan(
+        method=method,
+        linear_solver=_linear_solver(ode, count, rank),
+        operations=_operations(lambda y: ode.field(t0, y), y),
+        one_kernel=enabled and not found,
+        hindrances=found,
+        left_out=tuple(_left_out(ode, solve)),
         coordinates=ode.layout.size,
         constraints=count,
         independent=None if traced else rank or count,
         mass=_mass(system, ode.mass(y[0])),
         constraints_depend_on_time=any(ode.depends_on_time),
-        linear_solver=_linear_solver(ode, count, rank),
         nonzeros=None if sparse is None else int((sparse.columns >= 0).sum()),
         colours=None if sparse is None else len(sparse.columns),
-        operations=_operations(lambda y: ode.field(t0, y), y),
-        one_kernel=enabled and not found,
+    )
+
+
+def _of_residual(
+    pencil: Pencil, t0: Any, y: Any, method: str, one_kernel: bool, found: tuple[str, ...]
+) -> ResidualPlan:
+    outline, n = pencil.outline, y.size
+    colours = tuple(n if c is None else len(c.seeds) for c in (outline.by_y, outline.by_rate))
+    return ResidualPlan(
+        method=method,
+        linear_solver=outline.storage.describe(),
+        operations=_operations(lambda y: pencil.residual(t0, y, y), y),
+        one_kernel=one_kernel,
         hindrances=found,
-        left_out=tuple(_left_out(system, ode, solve)),
+        left_out=("directional derivatives of structural zeros",) if sum(colours) < 2 * n else (),
+        unknowns=n,
+        indices=outline.indices,
+        derivatives=int(outline.differential.sum()),
+        colours=colours,
     )
 
 
@@ -145,8 +209,8 @@ def _linear_solver(ode: MechanicalODE, count: int, rank: int | None) -> str:
     return f"dense elimination of {count} unknowns, {kind}"
 
 
-def _left_out(system: Any, ode: MechanicalODE, solve: Solve) -> Iterator[str]:
-    if system.mass is None:
+def _left_out(ode: MechanicalODE, solve: Solve) -> Iterator[str]:
+    if ode.system.mass is None:
         yield "mass solve"
     if not any(ode.depends_on_time):
         yield "time derivatives of the constraints"

@@ -107,15 +107,15 @@ class ResidualForm(eqx.Module):
         n, m, p = ode.layout.size, ode.holonomic, ode.nonholonomic
         q, v, multipliers = y[:n], y[n : 2 * n], y[2 * n : 2 * n + m + p]
         a, mass = ode.constraint_jacobian(t, q, v), ode.mass(q)
-        weighted = lambda x: x if mass is None else mass * x if mass.ndim < 2 else mass @ x
-        momentum = weighted(yd[n : 2 * n]) - ode.force(t, q, v) + multipliers @ a
+        weighted = lambda x: x if mass is None else mass * x if mass.ndim < 2 else jnp.sum(mass * x, 1)
+        momentum = weighted(yd[n : 2 * n]) - ode.force(t, q, v) + jnp.sum(multipliers[:, None] * a, 0)
         velocity = ode.velocity_constraint(t, q, v)
         kinematics = yd[:n] - v
         if self.form == "index-3":
             return jnp.concatenate([kinematics, momentum, ode.constraint(t, q), velocity[m:]])
         if self.form == "index-2":
             return jnp.concatenate([kinematics, momentum, velocity])
-        stabilised = weighted(kinematics) + y[2 * n + m + p :] @ a[:m]
+        stabilised = weighted(kinematics) + jnp.sum(y[2 * n + m + p :, None] * a[:m], 0)
         return jnp.concatenate([stabilised, momentum, velocity, ode.constraint(t, q)])
 
 

@@ -42,5 +42,6 @@ METHODS = [
     Method("tangent-tsit5", dae_jax.TangentSpace(diffrax.Tsit5()), 5, True, adaptive=True),
     Method("tangent-dopri8", dae_jax.TangentSpace(diffrax.Dopri8()), 8, True, adaptive=True),
     Method("state-space", diffrax.Tsit5(), 5, True, dae_jax.StateSpace(pendulum_chart), adaptive=True),
+    Method("radau", dae_jax.RadauIIA5(), 5, adaptive=True),
     Method("rattle", dae_jax.RATTLE(), 2, True),
 ]

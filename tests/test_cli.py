@@ -22,6 +22,15 @@ def test_compare_writes_table_data_and_figures(tmp_path, capsys):
     assert np.load(tmp_path / "solutions.npz")["rattle_q"].shape == (501, 2)
 
 
+def test_compare_takes_problems_that_are_no_mechanisms(tmp_path, capsys):
+    assert main(["compare", "jay", "--rtol", "1e-6", "--methods", "radau", "--out", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert "errors relative" in out
+    assert "–" in out
+    assert np.load(tmp_path / "solutions.npz")["radau_x"].shape == (501, 4)
+    assert (tmp_path / "solution-radau.png").stat().st_size > 10_000
+
+
 def test_a_method_that_does_not_apply_says_why(tmp_path, capsys):
     assert main(["compare", "knife-edge", "--t1", "0.5", "--methods", "rattle", "--out", str(tmp_path)]) == 0
     assert "holonomic constraints only" in capsys.readouterr().out

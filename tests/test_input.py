@@ -253,8 +253,3 @@ def test_a_force_in_float64_does_not_disturb_a_state_in_float32():
     assert sol.ys[0].dtype == jnp.float32
     exact = dae_jax.scenes.pendulum().reference(np.array([1.0]))
     np.testing.assert_allclose(sol.ys[0], exact[0], atol=1e-4)
-
-
-def test_systems_that_cannot_be_solved_yet_are_refused():
-    with pytest.raises(TypeError, match="not supported yet"):
-        dae_jax.daesolve(dae_jax.ImplicitDAE(lambda t, y, yd, a: yd), dae_jax.DOP853(), 0.0, 1.0, None, jnp.ones(2))

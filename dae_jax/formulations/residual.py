@@ -12,6 +12,9 @@ from ..systems import ConstrainedSystem
 from .differentiation import AbstractFormulation
 
 
+HIGHEST = 3
+
+
 class Residual(AbstractFormulation):
     """No equation is differentiated by hand: 0 = F(t, y, ẏ), for `RadauIIA5` and `BDF`.
 
@@ -48,7 +51,15 @@ class Residual(AbstractFormulation):
             ode = MechanicalODE.of(system, t, state, args)
             multipliers = ode.multipliers(t, ode.encode(state))
             y = jnp.concatenate([y[: form.layout.size], multipliers, jnp.zeros(form.extra - multipliers.size, y.dtype)])
-        return y, Pencil.of(form, y, self.variable_index)
+        pencil = Pencil.of(form, y, self.variable_index)
+        beyond = [name for name, k in zip(form.variables, pencil.outline.indices, strict=True) if k > HIGHEST]
+        if beyond:
+            raise ValueError(
+                f"The index of {', '.join(beyond)} is {max(pencil.outline.indices)}, and methods that take the equations "
+                f"as they are written converge for an index up to {HIGHEST} only. Solve the underlying ODE: "
+                "OrthogonalProjection(DOP853())."
+            )
+        return y, pencil
 
     def field(self, t: Any, y: Any, ode: Any) -> Any:
         """NaN: a residual has no ẏ in explicit form."""

@@ -28,7 +28,9 @@ _REFUSED = frozenset(
     "fft geqrf hessenberg householder_product infeed io_callback lu ormqr outfeed ppermute psum pure_callback qr "
     "random_gamma schur sort svd threefry2x32 top_k triangular_solve tridiagonal tridiagonal_solve".split()
 )
+_REDUCTIONS = frozenset("reduce_sum reduce_max reduce_min reduce_prod reduce_and reduce_or".split())
 SMALL_DOT = 64
+LARGE_REDUCTION = 4096
 _enabled: contextvars.ContextVar[bool] = contextvars.ContextVar("one_kernel", default=True)
 
 
@@ -75,6 +77,9 @@ def _hinders(eqn: Any) -> bool:
     if name.startswith("scatter"):
         # A single window is a dynamic update; several, as under `vmap`, are a loop that cannot be emitted.
         return math.prod(eqn.invars[1].aval.shape[:-1]) > 1
+    if name in _REDUCTIONS:
+        # XLA may hand the reduction of a large matrix to a library.
+        return eqn.invars[0].aval.size > LARGE_REDUCTION and eqn.outvars[0].aval.size > 1
     if name == "dot_general":
         # XLA writes out a small product; a larger one is a library call.
         (contracted, _), _ = eqn.params["dimension_numbers"]

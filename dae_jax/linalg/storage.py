@@ -5,6 +5,7 @@ derived by JAX in both modes. The unknowns of a band are reordered inside: vecto
 """
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax.numpy as jnp
@@ -22,6 +23,11 @@ class Dense:
     """
 
     size: int
+
+    def describe(self) -> str:
+        """In words."""
+        how = "inverses in plain arithmetic" if self.size <= LOOPED else "LU by LAPACK"
+        return f"dense, {self.size} × {self.size}, {how}"
 
     def factor(self, a: Inexact[Array, "n n"]) -> tuple[Any, Float[Array, ""]]:
         """The factors, and the smallest pivot relative to the entries of its row: round-off where A is singular."""
@@ -58,7 +64,7 @@ class Dense:
             product = lax.fori_loop(0, self.size, outer, jnp.zeros_like(a))
         else:
             product = jnp.dot(a.T, a, precision=lax.Precision.HIGHEST)
-        factors, _ = self.factor(product + _cut(a) * jnp.eye(self.size, dtype=a.dtype))
+        factors, _ = self.factor(product + _cut(jnp.sum(a * a, 1)) * jnp.eye(self.size, dtype=a.dtype))
         return self.solve(factors, jnp.sum(a * (scale * b[:, None]), 0))
 
     def coupled(
@@ -94,6 +100,10 @@ class Banded:
         """Entries kept of a row."""
         return self.lower + 1 + self.upper
 
+    def describe(self) -> str:
+        """In words."""
+        return f"a band of {self.lower} diagonals below and {self.upper} above, {self.size} unknowns"
+
     def positions(self) -> tuple[Int[np.ndarray, "n width"], Int[np.ndarray, "n width"]]:
         """Row and column, in the vectors' own order, of each entry; −1 for columns outside."""
         places = np.arange(self.size)[:, None] + np.arange(-self.lower, self.upper + 1)
@@ -103,7 +113,7 @@ class Banded:
 
     def factor(self, a: Inexact[Array, "n width"]) -> tuple[Any, Float[Array, ""]]:
         """The factors, by Gaussian elimination with partial pivoting in a window that moves down the band."""
-        scale = _row_scale(a)
+        scale = _scale(_along_rows(jnp.maximum, _size(a)))
         lower, reach = self.lower, self.lower + self.upper + 1
         if not lower:
             upper = (a * scale[:, None], scale)
@@ -158,7 +168,7 @@ class Banded:
     def apply(self, a: Inexact[Array, "n width"], x: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
         """A x."""
         _, columns = self.positions()
-        return jnp.sum(a * jnp.where(columns >= 0, x[columns], 0), 1)[np.argsort(self.rows)]
+        return _along_rows(jnp.add, a * jnp.where(columns >= 0, x[columns], 0))[np.argsort(self.rows)]
 
     def scale_columns(self, a: Inexact[Array, "n width"], scale: Inexact[Array, " n"]) -> Inexact[Array, "n width"]:
         """A diag(scale)."""
@@ -170,7 +180,7 @@ class Banded:
         From r + A x = b and Aᵀ r = ε x, which has a band too.
         """
         n, reach = self.size, max(self.lower, self.upper)
-        scale = _row_scale(a)
+        scale = _scale(_along_rows(jnp.maximum, _size(a)))
         a = a * scale[:, None]
         offsets = np.arange(-reach, reach + 1)
         wide = jnp.pad(a, ((0, 0), (reach - self.lower, reach - self.upper)))
@@ -180,8 +190,9 @@ class Banded:
         transposed = jnp.where(inside, wide[np.clip(rows, 0, n - 1), reach - offsets], 0)
         diagonal = jnp.broadcast_to(jnp.asarray(offsets == 0, a.dtype), wide.shape)
         in_place = Banded(np.arange(n), np.arange(n), reach, reach)
+        cut = _cut(_along_rows(jnp.add, a * a))
         both, matrix = in_place.coupled(
-            [diagonal, -_cut(a) * diagonal], [wide, transposed], jnp.asarray([[0.0, 1.0], [1.0, 0.0]], a.dtype)
+            [diagonal, -cut * diagonal], [wide, transposed], jnp.asarray([[0.0, 1.0], [1.0, 0.0]], a.dtype)
         )
         factors, _ = both.factor(matrix)
         right = jnp.stack([b[self.rows] * scale, jnp.zeros_like(b)], 1).reshape(-1)
@@ -207,15 +218,23 @@ class Banded:
 Storage = Dense | Banded
 
 
-def _cut(a: Float[Array, "n k"]) -> Float[Array, ""]:
-    """Squared singular values of A below this count as 0."""
-    largest = jnp.max(jnp.sum(a * a, 1))
-    return 100 * jnp.finfo(a.dtype).eps * jnp.where(largest > 0, largest, 1)
+def _cut(squares: Float[Array, " n"]) -> Float[Array, ""]:
+    """Squared singular values of A below this count as 0, by the sums of squares of its rows."""
+    largest = jnp.max(squares)
+    return 100 * jnp.finfo(squares.dtype).eps * jnp.where(largest > 0, largest, 1)
 
 
 def _row_scale(a: Inexact[Array, "n k"]) -> Float[Array, " n"]:
-    largest = jnp.max(_size(a), 1)
+    return _scale(jnp.max(_size(a), 1))
+
+
+def _scale(largest: Float[Array, " n"]) -> Float[Array, " n"]:
     return 1 / jnp.where(largest > 0, largest, 1)
+
+
+def _along_rows(combine: Any, a: Inexact[Array, "n k"]) -> Inexact[Array, " n"]:
+    """A reduction of each row of a band. XLA hands that of a large matrix to a library, column by column it does not."""
+    return functools.reduce(combine, [a[:, k] for k in range(a.shape[1])])
 
 
 def _size(x: Inexact[Array, "*shape"]) -> Float[Array, "*shape"]:

@@ -3,7 +3,10 @@
 import functools
 from collections.abc import Callable
 
+from .chemistry import akzo_nobel as akzo_nobel, robertson as robertson
+from .circuits import amplifier as amplifier, capacitor_loop as capacitor_loop
 from .double_pendulum import chain as chain, double_pendulum as double_pendulum
+from .hessenberg import hessenberg_2 as hessenberg_2, integrators as integrators, jay as jay
 from .mechanisms import four_bar as four_bar, slider_crank as slider_crank
 from .pendulum import (
     moving_pivot_pendulum as moving_pivot_pendulum,
@@ -11,18 +14,29 @@ from .pendulum import (
     spherical_pendulum as spherical_pendulum,
 )
 from .scene import Scene as Scene
+from .stiff_mechanisms import andrews as andrews, car_axis as car_axis
 from .surfaces import bead_on_torus as bead_on_torus, knife_edge as knife_edge
 
 
 SCENES: dict[str, Callable[[], Scene]] = {
+    "akzo-nobel": akzo_nobel,
+    "amplifier": amplifier,
+    "andrews": andrews,
     "bead-on-torus": bead_on_torus,
+    "capacitor-loop": capacitor_loop,
+    "car-axis": car_axis,
     "chain": chain,
     "double-pendulum": double_pendulum,
     "four-bar": four_bar,
     "four-bar-redundant": functools.partial(four_bar, redundant=True),
+    "hessenberg-2": hessenberg_2,
+    "integrators-4": functools.partial(integrators, 4),
+    "integrators-5": functools.partial(integrators, 5),
+    "jay": jay,
     "knife-edge": knife_edge,
     "moving-pivot-pendulum": moving_pivot_pendulum,
     "pendulum": pendulum,
+    "robertson": robertson,
     "slider-crank": slider_crank,
     "spherical-pendulum": spherical_pendulum,
 }

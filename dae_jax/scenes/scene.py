@@ -4,9 +4,10 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import numpy as np
 
-from ..systems import ConstrainedSystem
+from ..systems import System
 
 
 State = tuple[np.ndarray, np.ndarray]
@@ -17,21 +18,47 @@ class Scene:
     """A system, where it starts, and a reference that does not use the library.
 
     - `name`; `system`; `args`.
-    - `y0`: (q, v), consistent to round-off, as numpy float64 arrays.
+    - `y0`: the start, consistent to round-off, as numpy float64 arrays: (q, v), (x, z) or y.
     - `t1`: a natural end time, in s.
-    - `reference(times)`: (q, v) at the given times, with a leading axis of times.
+    - `reference(times)`: the state at the given times, with a leading axis of times; NaN where nothing is known.
     - `horizon`: until when the reference can be trusted to about 1e-7 (chaos), in s.
     - `chart`: a global chart ψ for `StateSpace`, where there is one.
+    - `index`: the differentiation index.
+    - `scale`: the size below which a variable counts as zero: atol = scale · rtol, and errors are relative to the larger
+      of it and the reference.
     """
 
     name: str
-    system: ConstrainedSystem
-    y0: State
+    system: System
+    y0: Any
     t1: float
-    reference: Callable[[np.ndarray], State]
+    reference: Callable[[np.ndarray], Any]
     horizon: float = np.inf
     chart: Callable[..., Any] | None = None
     args: Any = None
+    index: int = 3
+    scale: float = 1.0
+
+    def error(self, times: np.ndarray, ys: Any) -> float:
+        """The largest error of states at the given times, relative where the reference is larger than `scale`."""
+        within = np.asarray(times) <= self.horizon
+        exact = jax.tree.leaves(self.reference(np.asarray(times)[within]))
+        off = [
+            np.abs(np.asarray(y)[within] - e) / np.maximum(np.abs(e), self.scale)
+            for y, e in zip(jax.tree.leaves(ys), exact, strict=True)
+        ]
+        known = np.concatenate([x[~np.isnan(e)] for x, e in zip(off, exact, strict=True)])
+        return float(known.max()) if known.size else np.nan
+
+
+def published(t1: float, end: Any) -> Callable[[np.ndarray], Any]:
+    """A reference of which only the state at `t1` is published."""
+
+    def reference(times: np.ndarray) -> Any:
+        at_end = np.asarray(times) == t1
+        return jax.tree.map(lambda e: np.where(at_end[:, None], e, np.nan), end)
+
+    return reference
 
 
 def minimal(

@@ -66,4 +66,4 @@ def knife_edge(slope: float = 0.3, turn: float = 1.0, gravity: float = 9.81) -> 
         return q, np.stack([speed * c, speed * s, np.full_like(t, turn)], -1)
 
     q0, v0 = (x[0] for x in reference(np.zeros(1)))
-    return Scene("knife-edge", system, (q0, v0), 10.0, reference)
+    return Scene("knife-edge", system, (q0, v0), 10.0, reference, index=2)

@@ -73,7 +73,8 @@ class _Step(NamedTuple):
 
     @property
     def h(self) -> Any:
-        return self.t1 - self.t0
+        # A lane of a batch that has ended goes on with steps of length 0, whose derivatives are multiplied by 0.
+        return jnp.where(self.t1 == self.t0, 1, self.t1 - self.t0)
 
     def stages(self, z: Float[Array, "3 n"]) -> Any:
         """(tᵢ, Yᵢ, ẏ at tᵢ) of each stage."""

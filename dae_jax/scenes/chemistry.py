@@ -1,0 +1,72 @@
+"""Stiff reactions with conservation laws: Robertson's, and the Akzo Nobel problem; both of index 1."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..systems import ImplicitDAE, SemiExplicitDAE
+from .scene import Scene, published
+
+
+def robertson() -> Scene:
+    """H. H. Robertson's autocatalytic reaction with the conservation of mass as an equation; x = (y₁, y₂), z = y₃.
+
+        ẏ₁ = −0.04 y₁ + 10⁴ y₂ y₃,   ẏ₂ = 0.04 y₁ − 10⁴ y₂ y₃ − 3·10⁷ y₂²,   0 = y₁ + y₂ + y₃ − 1.
+
+    Source of the end values: F. Mazzia, C. Magherini, *Test Set for IVP Solvers* 2.4 (Bari, 2008).
+    """
+
+    def f(t, x, z, args):
+        forth, back, twice = 0.04 * x[0], 1e4 * x[1] * z[0], 3e7 * x[1] ** 2
+        return jnp.stack([back - forth, forth - back - twice])
+
+    system = SemiExplicitDAE(f, lambda t, x, z, args: jnp.stack([x[0] + x[1] + z[0] - 1]))
+    end = (np.array([0.2083340149701255e-7, 0.8333360770334713e-13]), np.array([0.9999999791665050]))
+    start = (np.array([1.0, 0.0]), np.array([0.0]))
+    return Scene("robertson", system, start, 1e11, published(1e11, end), index=1, scale=1e-6)
+
+
+def akzo_nobel() -> Scene:
+    """The chemical Akzo Nobel problem: six species, one of them in equilibrium, carbon dioxide dissolved from the gas.
+
+    Source: as of `robertson`; the equations and end values of its problem "Chemical Akzo Nobel".
+    """
+    k1, k2, k3, k4, equilibrium, inflow, dissolution, pressure, henry = (
+        18.7,
+        0.58,
+        0.09,
+        0.42,
+        34.4,
+        3.3,
+        115.83,
+        0.9,
+        737.0,
+    )
+
+    def residual(t, y, yd, args):
+        a, oxygen, b, c, d, e = y
+        root = jnp.sqrt(oxygen)
+        r1, r2, r3 = k1 * a**4 * root, k2 * b * c, k2 / equilibrium * a * d
+        r4, r5 = k3 * a * c**2, k4 * e**2 * root
+        return jnp.stack(
+            [
+                yd[0] + 2 * r1 - r2 + r3 + r4,
+                yd[1] + r1 / 2 + r4 + r5 / 2 - inflow * (pressure / henry - oxygen),
+                yd[2] - r1 + r2 - r3,
+                yd[3] + r2 - r3 + 2 * r4,
+                yd[4] - r2 + r3 - r5,
+                dissolution * a * c - e,
+            ]
+        )
+
+    start = np.array([0.444, 0.00123, 0.0, 0.007, 0.0, dissolution * 0.444 * 0.007])
+    end = np.array(
+        [
+            0.1150794920661702,
+            0.1203831471567715e-2,
+            0.1611562887407974,
+            0.3656156421249283e-3,
+            0.1708010885264404e-1,
+            0.4873531310307455e-2,
+        ]
+    )
+    return Scene("akzo-nobel", ImplicitDAE(residual), start, 180.0, published(180.0, end), index=1, scale=1e-3)
