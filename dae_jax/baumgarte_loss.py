@@ -1,10 +1,10 @@
 """How good Baumgarte's α and β are, as a smooth function of both: the loss to tune them by."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,12 +21,13 @@ from .systems import ConstrainedSystem
 FAILED = 50.0
 # What is below is round-off; a logarithm needs a floor.
 FLOOR = 1e-16
-# The error of a method with one step size can be zero by accident, for some α and β; with three of them at once it is not.
-STEP_RATIOS = (1.0, 0.87, 0.76)
+# The interval is solved in so many windows, each half as long and started on the reference. From a single start the error
+# can vanish by accident, for some α and β and all steps; from several at once it does not.
+WINDOWS = 4
 
 
 class Parts(NamedTuple):
-    """What a `BaumgarteLoss` weighs: `drift`, `error` (root mean squares), `stiffness` (h ρ), and the solve's `result`."""
+    """What a `BaumgarteLoss` weighs: `drift`, `error` (root mean squares), `stiffness` (dt0 ρ), and the solves' `result`."""
 
     drift: Float[Array, ""]
     error: Float[Array, ""]
@@ -34,36 +35,42 @@ class Parts(NamedTuple):
     result: Any
 
 
-class Verification(NamedTuple):
-    """Largest deviations from the reference over the times of the loss, each by a solve that the loss did not use.
+class Deviation(NamedTuple):
+    """Root mean squares of (q, v) minus the reference, and of g (and h); infinite where the solve failed."""
 
-    - `tight`: adaptive steps at rtol 1e-11: what remains is the formulation's own, and should be round-off.
-    - `at_dt0`, `at_half_dt0`: Tsit5 or the given solver with the steps dt0 and dt0/2; a real optimum falls with the
-      method's order, an accident does not.
+    error: float
+    drift: float
+
+
+class Verification(NamedTuple):
+    """Solves that the loss does not use: of the whole interval at once.
+
+    - `tight`: adaptive steps of DOP853 at rtol 1e-11: the formulation itself, apart from any step size.
+    - `at_dt0`, `at_half_dt0`: the loss's solver with steps of dt0 and dt0/2.
     """
 
-    tight: float
-    at_dt0: float
-    at_half_dt0: float
+    tight: Deviation
+    at_dt0: Deviation
+    at_half_dt0: Deviation
 
 
-class BaumgarteLoss(eqx.Module):
+@dataclasses.dataclass(frozen=True, eq=False)
+class BaumgarteLoss:
     """See `baumgarte_loss`. Called with {"alpha": α, "beta": β} it gives the loss."""
 
     system: ConstrainedSystem
     y0: Any
     args: Any
-    times: Float[Array, " times"]
-    dt0: Float[Array, ""]
+    times: Float[np.ndarray, " times"]
+    dt0: float
     reference: Any
     solver: diffrax.AbstractSolver
-    weights: tuple[float, float, float] = eqx.field(static=True)
-    max_steps: int = eqx.field(static=True)
+    weights: tuple[float, float, float]
 
     def __call__(self, params: dict[str, Any]) -> Float[Array, ""]:
         drift, error, stiffness, result = self.parts(params)
         of_drift, of_error, of_cost = self.weights
-        # Where a solve failed, zeros go through the logarithms, so that no NaN reaches a derivative.
+        # Where a solve failed, ones go through the logarithms, so that no NaN reaches a derivative.
         okay = result == RESULTS.successful
         decades = [jnp.log10(FLOOR + jnp.where(okay, x, 1.0)) for x in (drift, error)]
         value = of_drift * decades[0] + of_error * decades[1] + of_cost * stiffness
@@ -71,33 +78,48 @@ class BaumgarteLoss(eqx.Module):
         return jnp.where(okay & (value < FAILED), value, FAILED + of_cost * jnp.log1p(stiffness))
 
     def parts(self, params: dict[str, Any]) -> Parts:
-        """Drift, error and stiffness at {"alpha": α, "beta": β}; NaN or infinite where a solve failed."""
-        found = [self._fixed(params, ratio * self.dt0) for ratio in STEP_RATIOS]
-        drift, error = (
-            jnp.sqrt(sum(squares) / len(found)) for squares in zip(*(f[:2] for f in found), strict=True)
-        )
-        failed = [f[2] for f in found]
-        result = failed[0]
-        for other in failed[1:]:
-            result = RESULTS.where(result == RESULTS.successful, other, result)
+        """Drift, error and stiffness at {"alpha": α, "beta": β}; not finite where a solve failed."""
+        times = len(self.times) - 1
+        length = times // 2
+        firsts = np.arange(WINDOWS) * (times - length) // (WINDOWS - 1)
+        drifts, errors, results = jax.lax.map(lambda i: self._window(params, i, length), jnp.asarray(firsts))
+        code = RESULTS.successful
+        for w in range(WINDOWS):
+            code = RESULTS.where(code == RESULTS.successful, jax.tree.map(lambda x: x[w], results), code)
         rate = jnp.sqrt(4 * params["alpha"] ** 2 + 2 * params["beta"] ** 2)
-        return Parts(drift, error, self.dt0 * rate, result)
+        return Parts(jnp.sqrt(jnp.mean(drifts)), jnp.sqrt(jnp.mean(errors)), self.dt0 * rate, code)
 
     def verify(self, params: dict[str, Any]) -> Verification:
-        """Independent solves at {"alpha": α, "beta": β}."""
+        """Independent solves at {"alpha": α, "beta": β}, once from the start to the end."""
         controller = diffrax.PIDController(rtol=1e-11, atol=1e-11)
-        tight = self._solve(params, DOP853(), None, 10_000_000, stepsize_controller=controller, throw=True)
-        coarse, fine = (
-            self._solve(params, self.solver, float(h), 4 * self.max_steps, throw=True) for h in (self.dt0, self.dt0 / 2)
-        )
-        return Verification(*(_largest(sol.ys, self.reference) for sol in (tight, coarse, fine)))
+        tight = self._solve(params, DOP853(), None, self.y0, self.times, 10_000_000, stepsize_controller=controller)
+        fixed = [
+            self._solve(params, self.solver, h, self.y0, self.times, self._steps(self.times[-1], h))
+            for h in (self.dt0, self.dt0 / 2)
+        ]
+        return Verification(*map(self._deviation, (tight, *fixed)))
 
-    def _fixed(self, params: dict[str, Any], h: Any) -> tuple[Any, Any, Any]:
-        sol = self._solve(params, self.solver, h, self.max_steps, throw=False)
-        violations = jax.vmap(self._violations)(self.times, *sol.ys)
-        differences = jax.tree.map(lambda y, r: jnp.sum((y - r) ** 2), sol.ys, self.reference)
-        numbers = sum(leaf.size for leaf in jax.tree.leaves(self.reference))
-        return jnp.mean(violations**2), sum(jax.tree.leaves(differences)) / numbers, sol.result
+    def _window(self, params: dict[str, Any], first: Any, length: int) -> tuple[Any, Any, Any]:
+        """Mean squares of drift and error over the times after the first, and the result."""
+        times, reference = jax.tree.map(
+            lambda x: jax.lax.dynamic_slice_in_dim(jnp.asarray(x), first, length + 1), (self.times, self.reference)
+        )
+        start = jax.tree.map(lambda x: x[0], reference)
+        sol = self._solve(params, self.solver, self.dt0, start, times, self._steps(self.times[length], self.dt0))
+        return *self._mean_squares(times, sol.ys, reference), sol.result
+
+    def _deviation(self, sol: Any) -> Deviation:
+        if sol.result != RESULTS.successful:
+            return Deviation(np.inf, np.inf)
+        drift, error = self._mean_squares(jnp.asarray(self.times), sol.ys, self.reference)
+        return Deviation(float(error) ** 0.5, float(drift) ** 0.5)
+
+    def _mean_squares(self, times: Any, ys: Any, reference: Any) -> tuple[Any, Any]:
+        """Of the violations and of the errors, without the start, where both are zero."""
+        violations = jax.vmap(self._violations)(times[1:], *jax.tree.map(lambda y: y[1:], ys))
+        pairs = zip(jax.tree.leaves(ys), jax.tree.leaves(reference), strict=True)
+        differences = jnp.concatenate([jnp.ravel(y[1:] - r[1:]) for y, r in pairs])
+        return jnp.mean(violations**2), jnp.mean(differences**2)
 
     def _violations(self, t: Any, q: Any, v: Any) -> Any:
         found = []
@@ -107,12 +129,18 @@ class BaumgarteLoss(eqx.Module):
             found.append(jnp.ravel(self.system.nonholonomic(t, q, v, self.args)))
         return jnp.concatenate(found)
 
-    def _solve(self, params: dict[str, Any], solver: Any, h: Any, max_steps: int, **options: Any) -> Any:
+    def _solve(
+        self, params: dict[str, Any], solver: Any, h: Any, y0: Any, times: Any, max_steps: int, **options: Any
+    ) -> Any:
         return daesolve(
-            self.system, solver, 0.0, self.times[-1], h, self.y0, self.args,
-            formulation=Baumgarte(params["alpha"], params["beta"]), saveat=diffrax.SaveAt(ts=self.times),
-            adjoint=diffrax.ForwardMode(), max_steps=max_steps, **options,
+            self.system, solver, times[0], times[-1], h, y0, self.args,
+            formulation=Baumgarte(params["alpha"], params["beta"]), saveat=diffrax.SaveAt(ts=times),
+            adjoint=diffrax.ForwardMode(), max_steps=max_steps, throw=False, **options,
         )  # fmt: skip
+
+    @staticmethod
+    def _steps(duration: Any, h: float) -> int:
+        return int(np.ceil(float(duration) / h)) + 16
 
 
 def baumgarte_loss(
@@ -131,17 +159,18 @@ def baumgarte_loss(
 
         L(α, β) = w₁ log₁₀ D + w₂ log₁₀ E + w₃ dt0 ρ,
 
-    - D: the drift, the root mean square of g (and h) over the solution at `times` times;
-    - E: the error, the root mean square of (q, v) minus the reference at the same times;
+    - D: the drift, the root mean square of g (and h);
+    - E: the error, the root mean square of (q, v) minus the reference;
     - dt0 ρ, ρ² = 4α² + 2β²: the stiffness that the parameters bring. ρ is the Frobenius norm of [[0, β], [−β, −2α]], whose
       eigenvalues are the rates s of the feedback, s² + 2αs + β² = 0, so ρ ≥ |s|; an explicit method is stable up to
       about dt0 |s| = 3.
 
-    So a decade of drift, a decade of error and a third of the stable range weigh alike, by default.
+    So a decade of drift, a decade of error and a third of the stable range weigh alike, by default. D and E are taken
+    over four overlapping windows of half the interval, each started on the reference: from one start alone the error
+    vanishes by accident on a curve in the (α, β) plane.
 
-    The best α and β belong to a step size, and the loss is smooth for a given one; adaptive steps would add noise. At a
-    single step size the error can vanish by accident; D and E are therefore taken over three solves, with steps of 1, 0.87
-    and 0.76 dt0. A solve that fails has the loss 50 + w₃ log(1 + dt0 ρ), above all others.
+    The best α and β belong to a step size, and the loss is smooth for a given one; adaptive steps would add noise. A
+    solve that fails has the loss 50 + w₃ log(1 + dt0 ρ), above all others.
 
     **Arguments**
 
@@ -161,8 +190,10 @@ def baumgarte_loss(
     """
     if not (np.isfinite(dt0) and np.isfinite(t1) and 0 < dt0 <= t1):
         raise ValueError(f"`dt0` and `t1` must satisfy 0 < dt0 ≤ t1, but are {dt0} and {t1}.")
+    if times < 2 * WINDOWS:
+        raise ValueError(f"`times` must be at least {2 * WINDOWS}, but is {times}.")
     y0 = jax.tree.map(jnp.asarray, tuple(y0))
-    saved = jnp.linspace(0, t1, times + 1, dtype=jnp.result_type(*jax.tree.leaves(y0)))[1:]
+    saved = np.linspace(0, t1, times + 1, dtype=jnp.result_type(*jax.tree.leaves(y0)))
     if reference is None:
         rtol = 1e-12 if saved.dtype == jnp.float64 else 1e-6
         truth = daesolve(
@@ -170,16 +201,10 @@ def baumgarte_loss(
             stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol), max_steps=10_000_000,
         ).ys  # fmt: skip
     else:
-        truth = jax.tree.map(lambda x: jnp.asarray(x, saved.dtype), tuple(reference(np.asarray(saved))))
-    expected = jax.tree.map(lambda x: (times, *x.shape), y0)
+        truth = jax.tree.map(lambda x: np.asarray(x, saved.dtype), tuple(reference(saved)))
+    expected = jax.tree.map(lambda x: (times + 1, *x.shape), y0)
     found = jax.tree.map(jnp.shape, truth)
     if found != expected:
         raise ValueError(f"`reference` must give (q, v) of shapes {expected}, but gives {found}.")
-    max_steps = int(np.ceil(t1 / (min(STEP_RATIOS) * dt0))) + 16
-    return BaumgarteLoss(
-        system, y0, args, saved, jnp.asarray(dt0, saved.dtype), truth, solver, tuple(map(float, weights)), max_steps
-    )
+    return BaumgarteLoss(system, y0, args, saved, float(dt0), jax.tree.map(np.asarray, truth), solver, tuple(map(float, weights)))
 
-
-def _largest(a: Any, b: Any) -> float:
-    return max(float(jnp.max(jnp.abs(x - y))) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
