@@ -1,6 +1,7 @@
 """Differentiable solvers for differential-algebraic equations in JAX."""
 
 from .analyse import Structure as Structure, analyse as analyse
+from .baumgarte_loss import BaumgarteLoss as BaumgarteLoss, baumgarte_loss as baumgarte_loss
 from .diagnostics import Drift as Drift, drift as drift, energy as energy, multipliers as multipliers
 from .explain import MechanicalPlan as MechanicalPlan, Plan as Plan, ResidualPlan as ResidualPlan, explain as explain
 from .formulations import (
@@ -31,3 +32,4 @@ from .systems import (
     ImplicitDAE as ImplicitDAE,
     SemiExplicitDAE as SemiExplicitDAE,
 )
+from .tune import Tuned as Tuned, tune as tune

@@ -147,3 +147,41 @@ def scaling(curves: Curves, size: str, quantity: str, title: str = "") -> Any:
     axes.set(xlabel=size, ylabel=quantity, title=title)
     _legend_beside(figure)
     return figure
+
+
+def tuning(history: Any, title: str = "Descent") -> Any:
+    """The `history` that `tune` returns: the loss of every start over the steps, and what the parameters did."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.6, 4.2), layout="constrained", dpi=200)
+    left, right = figure.subplots(1, 2)
+    losses = np.asarray(history.loss)
+    winner = int(np.argmin(np.asarray(history.best)[:, -1]))
+    for i, loss in enumerate(losses):
+        if i != winner:
+            left.plot(loss, color=GREY, linewidth=0.8, alpha=0.7, label="other starts" if i == (winner == 0) else None)
+    left.plot(losses[winner], color=COLOURS[0], linewidth=1.2, label="best start")
+    left.plot(np.min(np.asarray(history.best), axis=0), "--", color=COLOURS[1], linewidth=1.2, label="best so far")
+    # Solves that failed are far above the rest, which is what is to be seen.
+    usual = losses[np.isfinite(losses)]
+    low, high = usual.min(), np.quantile(usual, 0.9)
+    margin = 0.1 * max(high - low, 1e-6)
+    left.set(xlabel="step", ylabel="loss", title=title, ylim=(low - margin, high + 2 * margin))
+    left.legend(frameon=False, fontsize="small")
+    for i, (name, path) in enumerate(_leaves(history.params)):
+        for j, component in enumerate(np.asarray(path)[winner].reshape(losses.shape[1], -1).T):
+            label = name if j == 0 else None
+            right.semilogy(component, color=COLOURS[i % len(COLOURS)], linewidth=1.4, label=label)
+    right.set(xlabel="step", ylabel="parameters of the best start")
+    right.legend(frameon=False, fontsize="small")
+    for axes in (left, right):
+        axes.grid(alpha=0.3, linewidth=0.5)
+    return figure
+
+
+def _leaves(tree: Any) -> list[tuple[str, Any]]:
+    """The leaves of a pytree with their names."""
+    import jax
+
+    found = jax.tree_util.tree_leaves_with_path(tree)
+    return [(jax.tree_util.keystr(path, simple=True, separator=".") or "parameter", leaf) for path, leaf in found]

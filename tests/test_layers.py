@@ -11,11 +11,11 @@ import pytest
 
 PACKAGE = Path(__file__).parent.parent / "dae_jax"
 LAYERS = (
-    {"kernels", "linalg", "structure"},
+    {"kernels", "linalg", "progress", "structure"},
     {"constraints", "initialise", "normals", "pencil", "residual", "systems"},
     {"formulations", "solvers"},
     {"analyse", "checks", "diagnostics", "explain", "program", "solution", "solve", "tape"},
-    {"compare", "plotting", "scenes", "sweep", "tune"},
+    {"baumgarte_loss", "compare", "plotting", "scenes", "sweep", "tune"},
     {"__main__", "cli"},
 )
 LAYER = {unit: level for level, units in enumerate(LAYERS) for unit in units}

@@ -1,0 +1,204 @@
+"""`tune` and the loss for Baumgarte's parameters."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+import dae_jax
+from dae_jax import plotting
+from dae_jax.scenes import SCENES
+
+
+BAD_START = {"alpha": 1.0, "beta": 1.0}
+
+
+@pytest.fixture(scope="module", params=[("pendulum", 0.05), ("double-pendulum", 0.02)], ids=lambda p: p[0])
+def case(request):
+    name, h = request.param
+    scene = SCENES[name]()
+    # The scene's reference is independent of the library.
+    loss = dae_jax.baumgarte_loss(scene.system, scene.y0, 5.0, dt0=h, reference=scene.reference)
+    return loss, jax.jit(loss)
+
+
+@pytest.fixture(scope="module")
+def tuned(case):
+    return dae_jax.tune(case[0], BAD_START, steps=60, progress=False)
+
+
+def grid(loss, side):
+    """The loss on a square grid, α and β from 0.1 to 1e4; infinite where it is not finite."""
+    axis = jnp.logspace(-1, 4, side)
+    alpha, beta = map(jnp.ravel, jnp.meshgrid(axis, axis, indexing="ij"))
+    return np.asarray(jax.jit(lambda p: jax.lax.map(loss, p))({"alpha": alpha, "beta": beta}))
+
+
+def test_bowl():
+    """A minimum that is known, from one start and from many, with the cost counted."""
+    target = jnp.array([20.0, 0.05])
+    loss = lambda p: jnp.sum(jnp.log(p["x"] / target) ** 2) + jnp.log(p["y"] / 3.0) ** 2
+    start = {"x": jnp.ones(2), "y": 1.0}
+    tuned = dae_jax.tune(loss, start, steps=80, tolerance=1e-6, progress=False)
+    np.testing.assert_allclose(tuned.params["x"], target, rtol=2e-2)
+    np.testing.assert_allclose(tuned.params["y"], 3.0, rtol=2e-2)
+    assert tuned.evaluations == tuned.history.loss.size * 4
+    many = dae_jax.tune(loss, start, steps=80, starts=5, progress=False)
+    assert many.history.params["x"].shape == (5, many.history.loss.shape[1], 2)
+    assert float(many.loss) == np.min(many.history.best[:, -1]) == np.min(many.history.loss)
+    np.testing.assert_array_equal(many.history.params["x"][0, 0], [1.0, 1.0])
+
+
+def test_the_first_of_many_starts_is_the_only_one_of_one():
+    loss = lambda p: jnp.log(p / 7.0) ** 2
+    one = dae_jax.tune(loss, 1.0, steps=10, progress=False)
+    many = dae_jax.tune(loss, 1.0, steps=10, starts=3, progress=False)
+    np.testing.assert_allclose(one.history.loss[0], many.history.loss[0], rtol=1e-12)
+
+
+def test_plateau_ends_the_descent():
+    tuned = dae_jax.tune(lambda p: 0 * p + 1.0, 2.0, steps=1000, progress=False)
+    assert tuned.history.loss.shape[1] <= 30
+
+
+def test_steps_that_are_no_multiple_of_a_block():
+    assert dae_jax.tune(lambda p: p, 2.0, steps=13, progress=False).history.loss.shape == (1, 13)
+
+
+def test_holes_are_left_and_never_the_best():
+    """A loss that is NaN above 5: the descent with steps of a factor e comes back out."""
+    loss = lambda p: jnp.where(p > 5, jnp.nan, -p)
+    tuned = dae_jax.tune(loss, 1.0, optax.sgd(1.0), steps=40, progress=False)
+    assert np.isnan(tuned.history.loss).any()
+    assert 4.0 < float(tuned.params) <= 5.0
+
+
+def test_another_optimiser_and_reverse_mode():
+    """Sixteen parameters: reverse mode, through a solve with its default adjoint."""
+    pendulum = SCENES["pendulum"]()
+
+    def loss(p):
+        sol = dae_jax.daesolve(
+            pendulum.system, diffrax.Tsit5(), 0.0, 0.1, 0.05, pendulum.y0,
+            formulation=dae_jax.Baumgarte(jnp.mean(p), jnp.mean(p)), throw=False,
+        )  # fmt: skip
+        return jnp.sum(jnp.log(p / 2) ** 2) + 0 * jnp.sum(sol.ys[0])
+
+    tuned = dae_jax.tune(loss, jnp.ones(16), optax.sgd(0.3), steps=20, progress=False)
+    np.testing.assert_allclose(tuned.params, 2.0, rtol=1e-2)
+    assert tuned.evaluations == tuned.history.loss.size * 4
+    # Two parameters ask for forward mode first, which this solve refuses.
+    few = dae_jax.tune(loss, jnp.ones(2), optax.sgd(0.3), steps=20, progress=False)
+    np.testing.assert_allclose(few.params, 2.0, rtol=1e-2)
+
+
+@pytest.mark.parametrize("params", [0.0, {"a": -1.0}, np.nan, jnp.array([1.0, jnp.inf])], ids=str)
+def test_parameters_must_be_positive(params):
+    with pytest.raises(ValueError, match="must be positive and finite"):
+        dae_jax.tune(lambda p: 1.0, params, steps=1)
+
+
+def test_a_loss_that_is_finite_nowhere_is_refused():
+    with pytest.raises(ValueError, match="not finite"):
+        dae_jax.tune(lambda p: p * jnp.nan, 1.0, steps=50, progress=False)
+
+
+def test_a_loss_that_is_no_number_is_refused():
+    with pytest.raises(ValueError, match="must return a real number"):
+        dae_jax.tune(lambda p: p, jnp.ones(2), steps=1)
+
+
+def test_progress_is_shown(capsys):
+    dae_jax.tune(lambda p: jnp.log(p) ** 2, 2.0, steps=10)
+    assert "10/10" in capsys.readouterr().err
+
+
+# The loss
+
+
+def test_gradient_of_the_loss_is_that_of_central_differences(case):
+    loss = case[1]
+    slope = jax.jit(jax.jacfwd(loss))
+    for alpha, beta in ((1.0, 1.0), (3.0, 7.0), (10.0, 10.0)):
+        p = {"alpha": jnp.asarray(alpha), "beta": jnp.asarray(beta)}
+        for name in p:
+            step = 1e-2 * p[name]
+            up, down = ({**p, name: p[name] + s} for s in (step, -step))
+            # The step balances truncation and the round-off of a drift of about 1e-9.
+            np.testing.assert_allclose(slope(p)[name], (loss(up) - loss(down)) / (2 * step), rtol=1e-3)
+
+
+def test_gradient_under_vmap(case):
+    _, loss = case
+    p = {"alpha": jnp.array([1.0, 30.0, 1e4]), "beta": jnp.array([5.0, 2.0, 1e4])}
+    slope = jax.jacfwd(loss)
+    together = jax.jit(jax.vmap(slope))(p)
+    for i in range(3):
+        alone = jax.jit(slope)(jax.tree.map(lambda x: x[i], p))
+        for name in p:
+            np.testing.assert_allclose(together[name][i], alone[name], rtol=1e-6)
+
+
+def test_a_solve_that_fails_is_no_win_and_its_slope_leads_back(case):
+    loss, compiled = case
+    stiff = {"alpha": 1e4, "beta": 1e4}
+    assert loss.parts(stiff).result != dae_jax.RESULTS.successful
+    assert np.isfinite(compiled(stiff))
+    assert compiled(stiff) > compiled(BAD_START) + 10
+    slope = jax.jit(jax.jacfwd(loss))(jax.tree.map(jnp.asarray, stiff))
+    assert all(s > 0 and np.isfinite(s) for s in slope.values())
+
+
+def test_tuning_is_as_good_as_a_grid_at_a_fraction_of_its_cost(case, tuned):
+    found = grid(case[0], 30)
+    assert np.isfinite(found).all()
+    assert float(tuned.loss) <= found.min()
+    # 2 % of the 100 × 100 grid that `benchmarks/tuning.py` compares with.
+    assert tuned.evaluations <= 200
+
+
+def test_a_tuned_result_holds_in_solves_that_the_loss_did_not_use(case, tuned):
+    loss, _ = case
+    before, after = loss.verify(BAD_START), loss.verify(tuned.params)
+    # 1e-11 times the growth of errors over 5 s, and the reference's own error: the formulation has the right solution.
+    assert after.tight.error < 1e-8
+    assert after.tight.drift < 1e-8
+    # What the loss promises, decades of drift and of error together, is there in one solve from start to end.
+    assert after.at_dt0.error * after.at_dt0.drift < before.at_dt0.error * before.at_dt0.drift
+    # An error that vanished by accident at one step size would not fall with the order (Tsit5: 32).
+    assert after.at_half_dt0.error < after.at_dt0.error / 10
+
+
+def test_a_failing_solve_verifies_as_infinite(case):
+    loss, _ = case
+    assert loss.verify({"alpha": 1e4, "beta": 1e4}).at_dt0.error == np.inf
+
+
+def test_nonholonomic_system_and_own_reference():
+    scene = SCENES["knife-edge"]()
+    loss = dae_jax.baumgarte_loss(scene.system, scene.y0, 2.0, dt0=0.05)
+    given = dae_jax.baumgarte_loss(scene.system, scene.y0, 2.0, dt0=0.05, reference=scene.reference)
+    np.testing.assert_allclose(loss(BAD_START), given(BAD_START), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"dt0": -0.1}, "0 < dt0"),
+        ({"dt0": 20.0}, "0 < dt0"),
+        ({"dt0": 0.1, "times": 3}, "`times` must be at least"),
+        ({"dt0": 0.1, "reference": lambda t: (np.ones((2, 2)), np.ones((2, 2)))}, "`reference` must give"),
+    ],
+)
+def test_wrong_input_is_refused(options, message):
+    scene = SCENES["pendulum"]()
+    with pytest.raises(ValueError, match=message):
+        dae_jax.baumgarte_loss(scene.system, scene.y0, 10.0, **options)
+
+
+def test_history_can_be_drawn(tmp_path):
+    tuned = dae_jax.tune(lambda p: jnp.log(p["a"]) ** 2, {"a": 3.0}, steps=10, starts=3, progress=False)
+    plotting.tuning(tuned.history).savefig(tmp_path / "history.png")
+    assert (tmp_path / "history.png").stat().st_size > 10_000
