@@ -66,7 +66,7 @@ def tune(
     starts: int = 1,
     progress: bool = True,
     spread: float = 10.0,
-    patience: int = 20,
+    patience: int = 30,
     tolerance: float = 1e-3,
     key: Any = None,
 ) -> Tuned:
@@ -82,8 +82,8 @@ def tune(
       mode, else reverse mode, and the other mode where JAX refuses the first. A `daesolve` inside it needs
       `adjoint=diffrax.ForwardMode()` for forward mode.
     - `params`: any pytree of positive numbers: the first start.
-    - `optimiser`: any optax optimiser; by default the gradient clipped to norm 1, then Adam with a rate that falls from
-      0.3 to 0.01 along a cosine.
+    - `optimiser`: any optax optimiser; by default the gradient clipped to norm 1, then Adam with Nesterov's momentum and a rate
+      that falls from 0.3 to 0.01 along a cosine.
     - `steps`: at most so many; ends earlier where no start has improved by `tolerance` within `patience` steps.
     - `starts`: how many descents run at once, batched. The others begin at `params` times factors drawn from
       1/`spread` to `spread`, uniformly in the logarithm, with `key`.
@@ -101,7 +101,7 @@ def tune(
         raise ValueError(f"`steps` and `starts` must be at least 1, but are {steps} and {starts}.")
     if optimiser is None:
         rate = optax.cosine_decay_schedule(0.3, steps, 0.01 / 0.3)
-        optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate))
+        optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.nadam(rate, b2=0.95))
     key = jax.random.key(0) if key is None else key
     factors = jax.random.uniform(key, (starts, logs.size), logs.dtype, -1, 1) * jnp.log(spread)
     z = logs + factors.at[0].set(0)

@@ -60,7 +60,7 @@ def test_the_first_of_many_starts_is_the_only_one_of_one():
 
 def test_plateau_ends_the_descent():
     tuned = dae_jax.tune(lambda p: 0 * p + 1.0, 2.0, steps=1000, progress=False)
-    assert tuned.history.loss.shape[1] <= 30
+    assert tuned.history.loss.shape[1] <= 40
 
 
 def test_steps_that_are_no_multiple_of_a_block():
@@ -124,10 +124,11 @@ def test_gradient_of_the_loss_is_that_of_central_differences(case):
     for alpha, beta in ((1.0, 1.0), (3.0, 7.0), (10.0, 10.0)):
         p = {"alpha": jnp.asarray(alpha), "beta": jnp.asarray(beta)}
         for name in p:
+            # Of fourth order, with a step that balances truncation and the round-off of a drift of about 1e-9.
             step = 1e-2 * p[name]
-            up, down = ({**p, name: p[name] + s} for s in (step, -step))
-            # The step balances truncation and the round-off of a drift of about 1e-9.
-            np.testing.assert_allclose(slope(p)[name], (loss(up) - loss(down)) / (2 * step), rtol=1e-3)
+            values = [loss({**p, name: p[name] + k * step}) for k in (-2, -1, 1, 2)]
+            central = (values[0] - 8 * values[1] + 8 * values[2] - values[3]) / (12 * step)
+            np.testing.assert_allclose(slope(p)[name], central, rtol=1e-4)
 
 
 def test_gradient_under_vmap(case):
