@@ -27,6 +27,7 @@ from .solvers import (
     TangentSpace as TangentSpace,
     Trapezoid as Trapezoid,
 )
+from .sweep import Grid as Grid, grid as grid, sweep as sweep
 from .systems import (
     ConstrainedSystem as ConstrainedSystem,
     ImplicitDAE as ImplicitDAE,

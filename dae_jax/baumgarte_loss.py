@@ -1,6 +1,7 @@
 """How good Baumgarte's α and β are, as a smooth function of both: the loss to tune them by."""
 
 import dataclasses
+import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -85,7 +86,7 @@ class BaumgarteLoss:
         drifts, errors, results = jax.lax.map(lambda i: self._window(params, i, length), jnp.asarray(firsts))
         code = RESULTS.successful
         for w in range(WINDOWS):
-            code = RESULTS.where(code == RESULTS.successful, jax.tree.map(lambda x: x[w], results), code)
+            code = RESULTS.where(code == RESULTS.successful, jax.tree.map(operator.itemgetter(w), results), code)
         rate = jnp.sqrt(4 * params["alpha"] ** 2 + 2 * params["beta"] ** 2)
         return Parts(jnp.sqrt(jnp.mean(drifts)), jnp.sqrt(jnp.mean(errors)), self.dt0 * rate, code)
 
@@ -206,5 +207,6 @@ def baumgarte_loss(
     found = jax.tree.map(jnp.shape, truth)
     if found != expected:
         raise ValueError(f"`reference` must give (q, v) of shapes {expected}, but gives {found}.")
-    return BaumgarteLoss(system, y0, args, saved, float(dt0), jax.tree.map(np.asarray, truth), solver, tuple(map(float, weights)))
-
+    return BaumgarteLoss(
+        system, y0, args, saved, float(dt0), jax.tree.map(np.asarray, truth), solver, tuple(map(float, weights))
+    )

@@ -185,3 +185,36 @@ def _leaves(tree: Any) -> list[tuple[str, Any]]:
 
     found = jax.tree_util.tree_leaves_with_path(tree)
     return [(jax.tree_util.keystr(path, simple=True, separator=".") or "parameter", leaf) for path, leaf in found]
+
+
+def sweep_map(
+    x: np.ndarray,
+    y: np.ndarray,
+    values: np.ndarray,
+    labels: tuple[str, str, str],
+    title: str = "",
+    *,
+    log: bool = False,
+    log_values: bool = False,
+    mark: tuple[float, float] | None = None,
+) -> Any:
+    """Values over a grid as colours, `values[i, j]` at (x[i], y[j]); white where they are NaN. `labels`: of x, y and the
+    colours, with units. `log`: log axes; `log_values`: log colours; `mark`: a point to point out.
+    """
+    from matplotlib.colors import LogNorm
+
+    figure, axes = _figure(6.4, 5.2)
+    axes.grid(visible=False)
+    norm = LogNorm() if log_values and np.nanmin(values) < np.nanmax(values) else None
+    mesh = axes.pcolormesh(
+        x, y, np.asarray(values).T, cmap="viridis_r" if log_values else "viridis", norm=norm, rasterized=True
+    )
+    axes.set(xlabel=labels[0], ylabel=labels[1], title=title)
+    axes.title.set_fontsize("medium")
+    if log:
+        axes.set(xscale="log", yscale="log")
+    if mark is not None:
+        axes.plot(*mark, marker="o", markersize=9, markerfacecolor="none", markeredgecolor="white", markeredgewidth=2)
+        axes.plot(*mark, marker="o", markersize=5, markerfacecolor="none", markeredgecolor="black")
+    figure.colorbar(mesh, ax=axes, label=labels[2])
+    return figure

@@ -31,6 +31,37 @@ def test_compare_takes_problems_that_are_no_mechanisms(tmp_path, capsys):
     assert (tmp_path / "solution-radau.png").stat().st_size > 10_000
 
 
+def test_sweep_draws_the_map_of_alpha_and_beta(tmp_path, capsys):
+    assert main(["sweep", "pendulum", "--points", "6", "--t1", "1", "--out", str(tmp_path)]) == 0
+    found = np.load(tmp_path / "baumgarte-pendulum.npz")
+    assert found["loss"].shape == (6, 6)
+    # α = β = 10⁴ at steps of 0.05 s is far beyond what an explicit method can.
+    assert found["failed"][-1, -1]
+    assert not found["failed"][0, 0]
+    assert (tmp_path / "baumgarte-pendulum.png").stat().st_size > 10_000
+    assert "baumgarte-pendulum.png" in capsys.readouterr().out
+
+
+def test_sweep_draws_the_maps_of_initial_angles(tmp_path):
+    assert main(["sweep", "angles", "--points", "6", "--t1", "4", "--out", str(tmp_path)]) == 0
+    found = np.load(tmp_path / "angles-flip.npz")
+    # Both arms near the top turn over, both near the bottom do not; the map is symmetric about the middle.
+    assert np.isinf(found["flip"][2:4, 2:4]).all()
+    assert np.isfinite(found["flip"]).any()
+    np.testing.assert_allclose(found["lyapunov"], found["lyapunov"][::-1, ::-1], atol=0.5)
+    assert not found["failed"].any()
+    for name in ("flip", "lyapunov"):
+        assert (tmp_path / f"angles-{name}.png").stat().st_size > 10_000
+
+
+def test_tune_prints_what_it_found_and_verifies_it(tmp_path, capsys):
+    assert main(["tune", "pendulum", "--steps", "10", "--t1", "1", "--out", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert "α = " in out
+    assert "verified with rtol 1e-11" in out
+    assert np.load(tmp_path / "tune-pendulum.npz")["alpha"].shape == (1, 10)
+
+
 def test_a_method_that_does_not_apply_says_why(tmp_path, capsys):
     assert main(["compare", "knife-edge", "--t1", "0.5", "--methods", "rattle", "--out", str(tmp_path)]) == 0
     assert "holonomic constraints only" in capsys.readouterr().out
@@ -46,6 +77,11 @@ def test_a_method_that_does_not_apply_says_why(tmp_path, capsys):
         ["compare", "pendulum", "--rtol", "0"],
         ["compare", "pendulum", "--no-such-option"],
         ["bench", "--parts", "magic"],
+        ["sweep", "robertson"],
+        ["sweep", "no-such-scene"],
+        ["sweep", "angles", "--points", "0"],
+        ["tune", "pendulum", "--dt0", "-1"],
+        ["tune", "jay"],
         [],
     ],
 )

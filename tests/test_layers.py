@@ -15,7 +15,7 @@ LAYERS = (
     {"constraints", "initialise", "normals", "pencil", "residual", "systems"},
     {"formulations", "solvers"},
     {"analyse", "checks", "diagnostics", "explain", "program", "solution", "solve", "tape"},
-    {"baumgarte_loss", "compare", "plotting", "scenes", "sweep", "tune"},
+    {"baumgarte_loss", "compare", "maps", "plotting", "reductions", "scenes", "sweep", "sweep_store", "tune"},
     {"__main__", "cli"},
 )
 LAYER = {unit: level for level, units in enumerate(LAYERS) for unit in units}

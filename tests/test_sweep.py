@@ -1,0 +1,255 @@
+"""`sweep` equals one at a time, in any number of pieces, processes and lives."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dae_jax
+from dae_jax import reductions
+from dae_jax.scenes import SCENES
+
+
+PENDULUM = SCENES["pendulum"]()
+DOUBLE = SCENES["double-pendulum"]()
+PROJECTED = dae_jax.OrthogonalProjection(dae_jax.DOP853())
+
+
+def swing(angle):
+    y0 = (jnp.stack([jnp.sin(angle), jnp.cos(angle)]), jnp.zeros(2))
+    sol = dae_jax.daesolve(PENDULUM.system, PROJECTED, 0.0, 1.0, None, y0, throw=False)
+    return {"q": sol.ys[0][-1], "drift": reductions.largest_drift(PENDULUM.system, sol)}
+
+
+@pytest.mark.parametrize("chunk_size", [None, 4, 7])
+def test_equals_one_at_a_time(chunk_size):
+    angles = np.linspace(0.1, 3.0, 23)
+    found = dae_jax.sweep(swing, angles, chunk_size=chunk_size, progress=False)
+    assert found["q"].shape == (23, 2)
+    one = jax.jit(swing)
+    for angle, q in zip(angles, found["q"], strict=True):
+        np.testing.assert_allclose(q, one(angle)["q"], rtol=1e-12, atol=1e-13)
+    assert found["drift"].max() < 1e-14
+
+
+def test_two_devices_give_the_same():
+    angles = np.linspace(0.1, 3.0, 23)
+    one = dae_jax.sweep(swing, angles, chunk_size=6, devices=jax.devices()[:1], progress=False)
+    both = dae_jax.sweep(swing, angles, chunk_size=6, devices=jax.devices(), progress=False)
+    assert len(jax.devices()) == 2
+    np.testing.assert_allclose(one["q"], both["q"], rtol=1e-13)
+
+
+def test_grid_has_named_axes():
+    found = dae_jax.sweep(
+        lambda p: p["a"] * 10 + p["b"], dae_jax.grid(a=[1.0, 2.0, 3.0], b=np.arange(4.0)), progress=False
+    )
+    np.testing.assert_array_equal(found, np.array([1.0, 2.0, 3.0])[:, None] * 10 + np.arange(4.0))
+
+
+def test_a_solve_that_fails_is_marked_and_the_rest_goes_on(capsys):
+    def fall(limit):
+        force = lambda t, q, v, args: jnp.where(t > args, jnp.nan, jnp.array([0.0, 9.81]))
+        system = dae_jax.ConstrainedSystem(force, PENDULUM.system.constraint)
+        sol = dae_jax.daesolve(system, PROJECTED, 0.0, 1.0, None, PENDULUM.y0, limit, throw=False)
+        return sol.ys[0][-1], sol.result
+
+    q, result = dae_jax.sweep(fall, np.array([2.0, 0.5, 3.0]))
+    np.testing.assert_array_equal(result == dae_jax.RESULTS.successful, [True, False, True])
+    np.testing.assert_array_equal(q[0], q[2])
+    assert "1 failed" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "inputs",
+    [np.float64(1.0), {"a": np.ones(3), "b": np.ones(4)}, np.ones((0, 2)), ()],
+    ids=["scalar", "uneven", "empty", "none"],
+)
+def test_inputs_without_a_leading_axis_are_refused(inputs):
+    with pytest.raises(ValueError, match="common leading axis"):
+        dae_jax.sweep(lambda x: x, inputs)
+
+
+def test_wrong_grids_and_chunks_are_refused():
+    with pytest.raises(ValueError, match="at least one axis"):
+        dae_jax.grid()
+    with pytest.raises(ValueError, match="`a` must be a sequence"):
+        dae_jax.grid(a=1.0)
+    with pytest.raises(ValueError, match="`chunk_size`"):
+        dae_jax.sweep(lambda x: x, np.ones(3), chunk_size=0)
+
+
+# The store
+
+
+def test_a_store_is_taken_up_again_and_refuses_another_sweep(tmp_path):
+    angles = np.linspace(0.1, 3.0, 23)
+    first = dae_jax.sweep(swing, angles, chunk_size=5, store=tmp_path / "s", progress=False)
+    done = np.load(tmp_path / "s" / "done.npy")
+    assert done.all()
+    again = dae_jax.sweep(swing, angles, chunk_size=5, store=tmp_path / "s", progress=False)
+    np.testing.assert_array_equal(first["q"], again["q"])
+    for other in (lambda: dae_jax.sweep(swing, angles + 1, chunk_size=5, store=tmp_path / "s", progress=False),
+                  lambda: dae_jax.sweep(lambda a: a, angles, chunk_size=5, store=tmp_path / "s", progress=False)):  # fmt: skip
+        with pytest.raises(ValueError, match="holds another sweep"):
+            other()
+
+
+def test_a_folder_of_something_else_is_refused(tmp_path):
+    (tmp_path / "thesis.txt").write_text("mine")
+    with pytest.raises(OSError, match="other files in it"):
+        dae_jax.sweep(lambda x: x, np.ones(3), store=tmp_path, progress=False)
+    assert (tmp_path / "thesis.txt").read_text() == "mine"
+
+
+def test_a_path_that_cannot_be_written_is_an_error_before_the_work(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match="cannot be written"):
+        dae_jax.sweep(lambda x: x, np.ones(3), store=tmp_path / "file" / "store", progress=False)
+
+
+def test_a_disk_without_room_is_an_error_before_the_work(tmp_path):
+    huge = lambda x: jnp.broadcast_to(x, (1 << 20, 1 << 12))
+    with pytest.raises(OSError, match=r"cannot be written .*it needs .* MB"):
+        # 4 GB an element, 10⁶ elements: more than any disk.
+        dae_jax.sweep(huge, np.ones(1_000_000), chunk_size=1, store=tmp_path / "s", progress=False)
+
+
+SLOW = """
+import sys, time
+import jax
+jax.config.update("jax_enable_x64", True)
+import jax.numpy as jnp, numpy as np
+import dae_jax
+
+def fn(x):
+    # Long enough that a kill comes in between.
+    return jax.lax.fori_loop(0, 400_000, lambda i, s: jnp.sin(s) + x, x)
+
+out = dae_jax.sweep(fn, np.linspace(0, 1, 400), chunk_size=10, progress=False, store=sys.argv[1])
+np.save(sys.argv[2], out)
+"""
+
+
+def test_a_killed_sweep_goes_on_and_ends_with_the_same_bits(tmp_path):
+    run = lambda store: subprocess.Popen(
+        [sys.executable, "-c", SLOW, str(tmp_path / store), str(tmp_path / f"{store}.npy")]
+    )
+    process = run("killed")
+    flags, deadline = tmp_path / "killed" / "done.npy", time.monotonic() + 60
+    while not ((tmp_path / "killed" / "sweep.json").exists() and np.load(flags).sum() >= 3):
+        assert time.monotonic() < deadline
+        assert process.poll() is None
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    done = np.load(flags)
+    assert 0 < done.sum() < done.size
+    assert run("killed").wait() == 0
+    assert run("whole").wait() == 0
+    assert np.load(flags).all()
+    np.testing.assert_array_equal(np.load(tmp_path / "killed.npy"), np.load(tmp_path / "whole.npy"))
+
+
+TWO = """
+import json, sys
+import jax
+jax.config.update("jax_enable_x64", True)
+address, index, store, out = sys.argv[1:]
+if index != "alone":
+    jax.distributed.initialize(coordinator_address=address, num_processes=2, process_id=int(index))
+import jax.numpy as jnp, numpy as np
+import dae_jax
+result = dae_jax.sweep(lambda p: jnp.sin(p["a"]) * p["b"], dae_jax.grid(a=np.linspace(0, 1, 9), b=np.linspace(0, 1, 7)),
+                       chunk_size=5, progress=False, store=store or None)
+np.save(out, result)
+"""
+
+
+@pytest.mark.parametrize("with_store", [False, True], ids=["memory", "store"])
+def test_two_processes_give_the_same_as_one(tmp_path, with_store):
+    with socket.socket() as probe:
+        probe.bind(("localhost", 0))
+        address = f"localhost:{probe.getsockname()[1]}"
+    names = {"0": "both", "1": "both", "alone": "alone"}
+    start = lambda index: subprocess.Popen(
+        [sys.executable, "-c", TWO, address, index, str(tmp_path / names[index]) if with_store else "", str(tmp_path / f"{index}.npy")],
+        env={**os.environ, "JAX_PLATFORMS": "cpu"},
+    )  # fmt: skip
+    processes = [start("0"), start("1"), start("alone")]
+    assert [p.wait(timeout=120) for p in processes] == [0, 0, 0]
+    first, second, alone = (np.load(tmp_path / f"{index}.npy") for index in names)
+    np.testing.assert_array_equal(first, second)
+    np.testing.assert_array_equal(first, alone)
+    if with_store:
+        assert json.loads((tmp_path / "both" / "sweep.json").read_text())["arrays"][0][1] == [63]
+
+
+# What is kept
+
+
+def test_reductions():
+    times = np.linspace(0, 2, 41)
+    sol = dae_jax.daesolve(PENDULUM.system, PROJECTED, 0.0, 2.0, None, PENDULUM.y0, saveat=diffrax.SaveAt(ts=times))
+    exact = PENDULUM.reference(times)
+    assert reductions.largest_error(sol, exact) == max(
+        float(np.abs(a - b).max()) for a, b in zip(sol.ys, exact, strict=True)
+    )
+    assert 0 < reductions.largest_error(sol, exact) < 1e-6
+    assert reductions.energy_error(PENDULUM.system, sol) < 1e-6
+    assert reductions.largest_drift(PENDULUM.system, sol) < 1e-14
+    np.testing.assert_array_equal(reductions.final_state(sol)[0], sol.ys[0][-1])
+
+
+def test_first_flip_of_a_pendulum_that_turns_over():
+    scene = dae_jax.scenes.pendulum(angle=0.0, angular_velocity=7.0)
+    times = np.linspace(0, 2, 2001)
+    q, _ = scene.reference(times)
+    top = times[np.argmax(np.diff(np.sign(q[:, 0])) < 0) + 1]
+    sol = dae_jax.daesolve(scene.system, PROJECTED, 0.0, 2.0, None, scene.y0, saveat=diffrax.SaveAt(ts=times))
+    np.testing.assert_allclose(reductions.first_flip(sol.ts, sol.ys[0]), top, atol=2e-3)
+    swings = dae_jax.daesolve(PENDULUM.system, PROJECTED, 0.0, 2.0, None, PENDULUM.y0, saveat=diffrax.SaveAt(ts=times))
+    assert reductions.first_flip(swings.ts, swings.ys[0]) == np.inf
+
+
+def test_lyapunov_exponent_is_the_growth_of_a_small_difference_in_minimal_coordinates():
+    """Of the double pendulum, by the reference that does not use the library, moved by a small angle."""
+    t1, small = 6.0, 1e-6
+    plus, minus = (dae_jax.scenes.double_pendulum(np.pi / 2 + s, np.pi / 2 + s) for s in (small, -small))
+    grown = [
+        (a[0] - b[0]) / (2 * small)
+        for a, b in zip(plus.reference(np.array([t1])), minus.reference(np.array([t1])), strict=True)
+    ]
+    start = [(a - b) / (2 * small) for a, b in zip(plus.y0, minus.y0, strict=True)]
+    norm = lambda parts: np.sqrt(sum(np.sum(np.asarray(x) ** 2) for x in parts))
+    controller = diffrax.PIDController(rtol=1e-10, atol=1e-10)
+
+    def end(s):
+        y0 = jax.tree.map(lambda y, d: y + s * d, jax.tree.map(jnp.asarray, DOUBLE.y0), tuple(map(jnp.asarray, start)))
+        y0 = dae_jax.consistent_state(DOUBLE.system, 0.0, y0)
+        sol = dae_jax.daesolve(
+            DOUBLE.system, PROJECTED, 0.0, t1, None, y0, adjoint=diffrax.ForwardMode(), stepsize_controller=controller
+        )
+        return reductions.final_state(sol)
+
+    _, tangent = jax.jvp(end, (0.0,), (1.0,))
+    np.testing.assert_allclose(np.concatenate(tangent), np.concatenate(grown), rtol=1e-4, atol=1e-4 * norm(grown))
+    exponent = reductions.lyapunov(
+        DOUBLE.system,
+        PROJECTED,
+        0.0,
+        t1,
+        jax.tree.map(jnp.asarray, DOUBLE.y0),
+        direction=tuple(map(jnp.asarray, start)),
+        stepsize_controller=controller,
+    )
+    np.testing.assert_allclose(exponent, np.log(norm(grown) / norm(start)) / t1, rtol=1e-4)
