@@ -122,9 +122,7 @@ class Structure:
             lines.append(f"{self.equations[i]:{width}}  {self.equation_offsets[i]}  {''.join(cells)}")
         lines += ["", "variable: d"]
         lines += [f"  {name}: {d}" for name, d in zip(self.variables, self.variable_offsets, strict=True)]
-        hidden = [
-            f"  0 = {name}" + (f", differentiated {k} times" if k else "") for name, k in self.hidden_constraints()
-        ]
+        hidden = [f"  0 = {name}" + _differentiated(k) for name, k in self.hidden_constraints()]
         free = [
             f"consistent are the values, with derivatives of orders below d, that satisfy{'' if hidden else ' nothing more'}"
         ]
@@ -168,6 +166,14 @@ def analyse(system: System, t0: Any, y0: Any, args: Any = None) -> Structure:
         sigma.transversal,
         tuple(block_triangular(pattern, sigma.transversal)),
         _regular(form, t, y, pattern, found),
+    )
+
+
+def _differentiated(times: int) -> str:
+    return (
+        ("", ", differentiated once", ", differentiated twice")[times]
+        if times < 3
+        else f", differentiated {times} times"
     )
 
 

@@ -87,8 +87,10 @@ def energy(curves: Curves, title: str = "Energy", unit: str = "J") -> Any:
     return figure
 
 
-def over_time(curves: Curves, quantity: str, title: str = "", exact: str | None = None) -> Any:
-    """Any quantity over time; `quantity` labels its axis, with the unit.
+def over_time(
+    curves: Curves, quantity: str, title: str = "", exact: str | None = None, along: str = "time in s"
+) -> Any:
+    """Any quantity over time, or over what `along` says; `quantity` labels its axis, with the unit.
 
     The curve called `exact` is drawn wide and grey behind the others, so that what agrees with it stays visible.
     """
@@ -100,7 +102,7 @@ def over_time(curves: Curves, quantity: str, title: str = "", exact: str | None 
         axes.plot(
             x, y, color=COLOURS[i % len(COLOURS)], linewidth=1.4, linestyle=("-", "--", "-.", ":")[i % 4], label=label
         )
-    axes.set(xlabel="time in s", ylabel=quantity, title=title)
+    axes.set(xlabel=along, ylabel=quantity, title=title)
     _legend_below(figure, 3)
     return figure
 
