@@ -21,6 +21,7 @@ from .structure import (
     signature,
 )
 from .systems import System
+from .taylor import total_derivatives
 
 
 # A system of more variables is summed up in words; its incidence matrix would not fit a page.
@@ -84,17 +85,8 @@ class Structure:
         """dᵏF/dtᵏ for k = `times`, as a function of t and of (y, ẏ, …, y^(k+1)), one below the other."""
 
         def along(t: Any, derivatives: Float[Array, "orders n"]) -> Float[Array, " n"]:
-            def curve(s: Any) -> Float[Array, " n"]:
-                # Taylor's polynomial in nested form: powers of s = 0 have no derivative in JAX.
-                value = derivatives[-1]
-                for k in reversed(range(1, len(derivatives))):
-                    value = derivatives[k - 1] + s / k * value
-                return value
-
-            residual = lambda s: self.form.residual(t + s, *jax.jvp(curve, (s,), (jnp.ones_like(s),)))
-            for _ in range(times):
-                residual = jax.jacfwd(residual)
-            return residual(jnp.zeros((), derivatives.dtype))
+            t = jnp.asarray(t, derivatives.dtype)
+            return total_derivatives(self.form.residual, t, list(derivatives), times + 1)[times]
 
         return along
 

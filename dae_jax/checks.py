@@ -16,6 +16,9 @@ from .solvers import RATTLE, AbstractManifoldSolver, RadauIIA5
 from .systems import ConstrainedSystem, ImplicitDAE, SemiExplicitDAE
 
 
+ADVICE = "\n`dae_jax.consistent_state(system, t0, y0, args)` gives the nearest state that does not."
+
+
 def checked(system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any) -> tuple[Any, Any]:
     """`y0` and `args` as arrays, once their types and shapes are right."""
     if isinstance(system, ConstrainedSystem):
@@ -92,10 +95,6 @@ def refuse_misfits(system: Any, formulation: Any, solver: Any, t0: Any, y0: Any,
             f"{name} needs an ODE, and Residual is none: solve it with RadauIIA5() or BDF(), or use {name} with "
             "Differentiation()."
         )
-    if not isinstance(system, ConstrainedSystem) and not takes_residuals(solver):
-        raise ValueError(
-            f"{name} needs an ODE; a {type(system).__name__} is solved as it is written by RadauIIA5() or BDF()."
-        )
     if isinstance(formulation, StateSpace) and isinstance(solver, AbstractManifoldSolver):
         raise ValueError(
             f"StateSpace has no constraints left for {type(solver).__name__} to keep: in its chart they hold by "
@@ -146,14 +145,11 @@ def refuse_bad_start(system: Any, t0: Any, y0: Any, args: Any) -> int | None:
     if not isinstance(system, ConstrainedSystem):
         left = _look_at_residual(system, t0, y0, args)
         if not bool(left.consistent()):
-            raise ValueError(left.message())
+            raise ValueError(left.message() + ADVICE)
         return None
     found, redundant = _look(system, t0, y0, args)
     if not bool(found.consistent()):
-        raise ValueError(
-            found.message()
-            + "\n`dae_jax.consistent_state(system, t0, y0, args)` gives the nearest state that does not."
-        )
+        raise ValueError(found.message() + ADVICE)
     count = found.residuals[1].shape[0]
     if system.rank is not None or redundant is None:
         return system.rank
@@ -175,8 +171,7 @@ def _look(system: Any, t: Any, y0: Any, args: Any) -> Any:
 
 @eqx.filter_jit
 def _look_at_residual(system: Any, t: Any, y0: Any, args: Any) -> Any:
-    y, pencil = Residual().encode(system, t, y0, args)
-    return unsolved(pencil, t, y)
+    return unsolved(system, t, y0, args)
 
 
 def saved_parts(saveat: Any) -> list[Any]:

@@ -12,7 +12,9 @@ from .constraints import MechanicalODE
 from .linalg import fixed_point, implicit_root, relative_change
 from .normals import mass_solve
 from .pencil import Pencil
-from .systems import ConstrainedSystem
+from .residual import ResidualForm
+from .systems import ConstrainedSystem, System
+from .underlying import StructuralODE
 
 
 class Violation(eqx.Module):
@@ -59,10 +61,12 @@ def violation(ode: MechanicalODE, t: Any, y: Any) -> Violation:
 
 
 class Unsolved(eqx.Module):
-    """What is left of F(t₀, y₀, ẏ₀) for the best ẏ₀, and how much of it counts as round-off of the user's numbers."""
+    """What is left of the equations and the hidden ones for the best derivatives, and how much of it counts as round-off
+    of the user's numbers.
+    """
 
-    residuals: Float[Array, " n"]
-    allowed: Float[Array, " n"]
+    residuals: Float[Array, " m"]
+    allowed: Float[Array, " m"]
     equations: tuple[str, ...] = eqx.field(static=True)
 
     def consistent(self) -> Bool[Array, ""]:
@@ -73,18 +77,29 @@ class Unsolved(eqx.Module):
         """Which equations are off, and by how much."""
         off = np.flatnonzero(~(np.abs(np.asarray(self.residuals)) <= np.asarray(self.allowed)))
         lines = [f"  0 = {self.equations[i]} is off by {float(self.residuals[i]):.6g}" for i in off]
-        return "The initial state `y0` violates the equations, whatever its derivative:\n" + "\n".join(lines)
+        return "The initial state `y0` violates the equations, whatever its derivatives:\n" + "\n".join(lines)
 
 
-def unsolved(pencil: Pencil, t: Any, y: Float[Array, " n"]) -> Unsolved:
-    """What no ẏ makes vanish of F(t, y, ẏ)."""
+def unsolved(system: System, t: Any, state: Any, args: Any) -> Unsolved:
+    """What no derivatives of a state make vanish of the equations of a system that is no mechanism."""
+    form = ResidualForm.of(system, t, state, args)
+    y = form.encode(state)
     t = jnp.asarray(t, y.dtype)
+    pencil = Pencil.of(form, y)
+    if pencil.outline.hidden:
+        ode = StructuralODE.of(form, y.dtype, complete=True)
+        return _left_over(ode, t, ode.start(t, y, jnp.zeros(form.size, y.dtype)))
     yd = pencil.rates(t, y)
     j, m = pencil.jacobians(t, y, yd)
     size = lambda x: 1 + jnp.max(jnp.abs(x))
     ones = jnp.ones_like(y)
     terms = pencil.storage.apply(jnp.abs(j), size(y) * ones) + pencil.storage.apply(jnp.abs(m), size(yd) * ones)
-    return Unsolved(pencil.residual(t, y, yd), jnp.finfo(y.dtype).eps ** 0.5 * terms, pencil.form.equations)
+    return Unsolved(pencil.residual(t, y, yd), jnp.finfo(y.dtype).eps ** 0.5 * terms, form.equations)
+
+
+def _left_over(ode: StructuralODE, t: Any, y: Float[Array, " N"]) -> Unsolved:
+    terms = jnp.sum(jnp.abs(ode.normals(t, y)), 1) * (1 + jnp.max(jnp.abs(y)))
+    return Unsolved(ode.violations(t, y), jnp.finfo(y.dtype).eps ** 0.5 * terms, ode.orders.names(ode.form))
 
 
 class Redundancy(eqx.Module):
@@ -112,35 +127,54 @@ def redundancy(ode: MechanicalODE, t: Any, y: Any) -> Redundancy:
     return Redundancy(jnp.sum(independent), contradiction)
 
 
-def consistent_state(system: ConstrainedSystem, t0: Any, y0: Any, args: Any = None, *, fixed: Any = None) -> Any:
-    """The nearest state (q, v) that satisfies the constraints and the hidden ones.
+def consistent_state(system: System, t0: Any, y0: Any, args: Any = None, *, fixed: Any = None) -> Any:
+    """The nearest state that satisfies the equations and the hidden ones.
 
-    Positions: the q with g(t₀, q) = 0 nearest to q₀ in the metric of the mass matrix at q₀; then the v with
-    G v + g_t = 0 and h = 0 nearest to v₀ in the same metric. Differentiable with respect to `y0` and `args`.
+    For a `ConstrainedSystem`, positions first: the q with g(t₀, q) = 0 nearest to q₀ in the metric of the mass matrix at
+    q₀; then the v with G v + g_t = 0 and h = 0 nearest to v₀ in the same metric. For other systems all entries count
+    alike, and the derivatives are whatever the equations ask for. Differentiable with respect to `y0` and `args`.
 
     **Arguments**
 
-    - `fixed`: a pytree of booleans (or boolean arrays) with the structure of `y0`; entries marked true are kept.
+    - `fixed`: a pytree of booleans (or boolean arrays) with the structure of `y0`; entries marked true are kept, such as
+      the differential variables of a circuit.
 
     Errors: `ValueError` where no such state is found from here, naming the equations that remain off; NaN where the
     arguments are traced.
     """
     y0 = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
-    ode = MechanicalODE.of(system, t0, y0, args)
     masks = jax.tree.map(lambda x: jnp.zeros_like(x, dtype=bool), y0)
     if fixed is not None:
         masks = jax.tree.map(lambda f, x: jnp.broadcast_to(jnp.asarray(f, bool), jnp.shape(x)), fixed, y0)
+    nearest = _nearest_of_mechanism if isinstance(system, ConstrainedSystem) else _nearest_of_any
+    found, fine, remains = nearest(system, t0, y0, args, masks)
+    if not isinstance(fine, jax.core.Tracer) and not bool(fine):
+        said, instead = "The initial state `y0` violates", "No consistent state was found near `y0`; left over are"
+        raise ValueError(
+            remains.message().replace(said, instead).replace(", whatever its derivatives", "")
+            + "\nThe equations may contradict each other, or too many entries are fixed."
+        )
+    return found
+
+
+def _nearest_of_mechanism(system: ConstrainedSystem, t: Any, y0: Any, args: Any, masks: Any) -> Any:
+    ode = MechanicalODE.of(system, t, y0, args)
     q, v = ode.encode(y0)
     weights = tuple(jnp.where(mask, 0, 1).astype(q.dtype) for mask in ode.encode(masks))
-    y, found, remains = _nearest(ode, jnp.asarray(t0, q.dtype), (q, v), weights)
-    if not isinstance(found, jax.core.Tracer) and not bool(found):
-        raise ValueError(
-            remains.message().replace(
-                "The initial state `y0` violates", "No consistent state was found near `y0`; left over are"
-            )
-            + "\nThe constraints may contradict each other, or too many entries are fixed."
-        )
-    return ode.decode(t0, y)
+    y, fine, remains = _nearest(ode, jnp.asarray(t, q.dtype), (q, v), weights)
+    return ode.decode(t, y), fine, remains
+
+
+@eqx.filter_jit
+def _nearest_of_any(system: System, t: Any, y0: Any, args: Any, masks: Any) -> Any:
+    form = ResidualForm.of(system, t, y0, args)
+    values = form.encode(y0)
+    t = jnp.asarray(t, values.dtype)
+    ode = StructuralODE.of(form, values.dtype, complete=True)
+    y = ode.start(t, values, jnp.where(form.encode(masks), 0, 1))
+    remains = _left_over(ode, t, y)
+    fine = remains.consistent()
+    return jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), ode.decode(t, y)), fine, remains
 
 
 @eqx.filter_jit

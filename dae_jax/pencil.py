@@ -47,13 +47,15 @@ class Outline:
     """What is known of a residual's linearisation before it is evaluated. Compared by identity: keep one for a pattern.
 
     `indices`, `offsets`: the index of each variable, and how often it is differentiated (d of the Σ-method);
-    `differential`: whether its derivative occurs; `by_y`, `by_rate`: the compressed Jacobians, `None` for small ones.
+    `differential`: whether its derivative occurs; `hidden`: whether an equation must be differentiated; `by_y`,
+    `by_rate`: the compressed Jacobians, `None` for small ones.
     """
 
     storage: Storage
     indices: tuple[int, ...]
     offsets: tuple[int, ...]
     differential: Bool[np.ndarray, " n"]
+    hidden: bool
     by_y: Compression | None
     by_rate: Compression | None
 
@@ -180,6 +182,7 @@ def _outline(on_y: bytes, on_rate: bytes, n: int) -> Outline:
         variable_indices(found, sigma),
         sigma.variable_offsets,
         by_rate.any(0),
+        any(sigma.equation_offsets),
         None if small else _compression(by_y, storage),
         None if small else _compression(by_rate, storage),
     )

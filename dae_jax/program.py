@@ -122,8 +122,7 @@ class Solve(eqx.Module):
             start = ode.encode(y0)
             consistent = violation(ode, t0, start).consistent()
         else:
-            start, pencil = self.formulation.encode(system, t0, y0, args)
-            consistent = unsolved(pencil, t0, start).consistent()
+            consistent = unsolved(system, t0, y0, args).consistent()
         sol = self._solution(eqx.combine(out, outline[0]), args, rank, consistent)
         return sol, consistent if rank is None else consistent & (redundancy(ode, t0, start).rank == rank)
 

@@ -5,7 +5,8 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ..constraints import ManifoldODE, MechanicalODE
+from ..constraints import ManifoldODE
+from ..underlying import underlying_ode
 from .differentiation import AbstractFormulation
 
 
@@ -35,8 +36,7 @@ class Baumgarte(AbstractFormulation):
     def encode(
         self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None
     ) -> tuple[Any, ManifoldODE]:
-        ode = MechanicalODE.of(system, t, state, args, rank)
-        return ode.encode(state), ode
+        return underlying_ode(system, t, state, args, rank)
 
     def field(self, t: Any, y: Any, ode: Any) -> Any:
         return ode.field(t, y, self)

@@ -6,7 +6,8 @@ from typing import Any
 import diffrax
 import equinox as eqx
 
-from ..constraints import ManifoldODE, MechanicalODE
+from ..constraints import ManifoldODE
+from ..underlying import underlying_ode
 
 
 class AbstractFormulation(eqx.Module):
@@ -50,8 +51,7 @@ class Differentiation(AbstractFormulation):
     def encode(
         self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None
     ) -> tuple[Any, ManifoldODE]:
-        ode = MechanicalODE.of(system, t, state, args, rank)
-        return ode.encode(state), ode
+        return underlying_ode(system, t, state, args, rank)
 
     def field(self, t: Any, y: Any, ode: Any) -> Any:
         return ode.field(t, y)
