@@ -9,6 +9,7 @@ from .formulations import (
     AbstractFormulation as AbstractFormulation,
     Baumgarte as Baumgarte,
     Differentiation as Differentiation,
+    DummyDerivatives as DummyDerivatives,
     Residual as Residual,
     StateSpace as StateSpace,
 )

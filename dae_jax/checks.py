@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from .constraints import MechanicalODE
-from .formulations import AbstractFormulation, Differentiation, Residual, StateSpace
+from .formulations import AbstractFormulation, Differentiation, DummyDerivatives, Residual, StateSpace
 from .initialise import redundancy, unsolved, violation
 from .normals import SparseNormals
-from .solvers import RATTLE, AbstractManifoldSolver, RadauIIA5
+from .solvers import RATTLE, AbstractManifoldSolver, RadauIIA5, unrolled
 from .systems import ConstrainedSystem, ImplicitDAE, SemiExplicitDAE
 
 
@@ -95,6 +95,13 @@ def refuse_misfits(system: Any, formulation: Any, solver: Any, t0: Any, y0: Any,
             f"{name} needs an ODE, and Residual is none: solve it with RadauIIA5() or BDF(), or use {name} with "
             "Differentiation()."
         )
+    if isinstance(formulation, DummyDerivatives) and not hasattr(unrolled(solver), "landing_step"):
+        raise ValueError(
+            "DummyDerivatives takes an explicit Runge–Kutta solver such as diffrax.Tsit5() or DOP853(), but got "
+            f"{_brief(solver)}."
+        )
+    if isinstance(formulation, StateSpace) and not isinstance(system, ConstrainedSystem):
+        raise ValueError("StateSpace takes a ConstrainedSystem: its chart gives the positions of a mechanism.")
     if isinstance(formulation, StateSpace) and isinstance(solver, AbstractManifoldSolver):
         raise ValueError(
             f"StateSpace has no constraints left for {type(solver).__name__} to keep: in its chart they hold by "
@@ -105,6 +112,8 @@ def refuse_misfits(system: Any, formulation: Any, solver: Any, t0: Any, y0: Any,
 
 
 def _fits_rattle(system: ConstrainedSystem, formulation: Any, t0: Any, y0: Any, args: Any) -> None:
+    if not isinstance(system, ConstrainedSystem):
+        raise ValueError("RATTLE takes a ConstrainedSystem; use SymmetricProjection for other systems.")
     if callable(system.mass):
         raise ValueError("RATTLE needs a constant mass matrix, but `mass` is a function; use SymmetricProjection.")
     if system.nonholonomic is not None:

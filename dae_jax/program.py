@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import diffrax
 import equinox as eqx
@@ -23,6 +23,7 @@ from .solvers import (
     DOP853,
     AbstractManifoldSolver,
     OrthogonalProjection,
+    SelectedStates,
     TangentSpace,
     first_step,
     unrolled,
@@ -213,6 +214,8 @@ class Solve(eqx.Module):
             self.event,
             cond_fn=jax.tree.map(lambda c: _on_states(c, decode, args), self.event.cond_fn, is_leaf=callable),
         )
+        selects = isinstance(solver, SelectedStates)
+        saveat = dataclasses.replace(saveat, solver_state=True) if selects else saveat
         sol = diffrax.diffeqsolve(
             self.formulation.term(),
             solver,
@@ -223,7 +226,8 @@ class Solve(eqx.Module):
         interpolation = None
         if sol.interpolation is not None:
             interpolation = Interpolation(_uniform(self.solver, sol.interpolation), decode, ode)
-        return sol.t0, sol.t1, sol.ts, sol.ys, interpolation, sol.stats, sol.result, sol.event_mask
+        stats = {**sol.stats, "switches": cast(Any, sol.solver_state).switches} if selects else sol.stats
+        return sol.t0, sol.t1, sol.ts, sol.ys, interpolation, stats, sol.result, sol.event_mask
 
     def _solution(self, out: Any, args: Any, rank: int | None, consistent: Any) -> DAESolution:
         *fields, result, event_mask = out

@@ -8,17 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from .checks import as_array, checked, refuse_bad_start, refuse_bad_times, refuse_misfits, takes_residuals
-from .formulations import AbstractFormulation, Differentiation, Residual
+from .formulations import AbstractFormulation, Differentiation, DummyDerivatives, Residual
 from .program import Program, Solve, run, split
 from .solution import RESULTS, DAESolution
-from .systems import ConstrainedSystem
+from .solvers import SelectedStates
+from .systems import System
 
 
 _ranks: dict[Program, int | None] = {}
 
 
 def daesolve(
-    system: ConstrainedSystem,
+    system: System,
     solver: diffrax.AbstractSolver,
     t0: Any,
     t1: Any,
@@ -43,9 +44,10 @@ def daesolve(
     - `solver`: any diffrax solver, or one that keeps its steps on the constraints (`OrthogonalProjection`,
       `SymmetricProjection`, `TangentSpace`, `RATTLE`).
     - `t0`, `t1`, `dt0`: start, end and first (or fixed) step; t1 < t0 integrates backwards, with dt0 < 0.
-    - `y0`: the state (q, v) at `t0`; must satisfy the constraints and their first derivative.
+    - `y0`: the state at `t0`: (q, v), (x, z) or y, as the system has it; must satisfy the equations, also the hidden ones.
     - `args`: handed to the system's functions.
-    - `formulation`: which equations are integrated; by default `Differentiation()`.
+    - `formulation`: which equations are integrated; by default `Differentiation()`, the underlying ODE, and `Residual()`
+      for solvers of 0 = F(t, y, ẏ) such as `RadauIIA5`.
     - `stepsize_controller`: by default fixed steps if `dt0` is given, else `PIDController(rtol=1e-8, atol=1e-8)` (1e-5 in
       float32).
     - `saveat`, `adjoint`, `event`, `max_steps`, `throw`, `progress_meter`: as in diffrax. Functions in `saveat` and
@@ -78,6 +80,8 @@ def prepared(
     if formulation is None:
         formulation = Residual() if takes_residuals(solver) else Differentiation()
     refuse_misfits(system, formulation, solver, t0, y0, args)
+    if isinstance(formulation, DummyDerivatives):
+        solver = SelectedStates(solver)
     dtype = jnp.result_type(*jax.tree.leaves(y0))
     if stepsize_controller is None:
         stepsize_controller = _default_controller(solver, dt0, dtype)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from .checks import is_saved_part
-from .solvers import AbstractImplicitSolver, AbstractManifoldSolver, OrthogonalProjection, unrolled
+from .solvers import AbstractImplicitSolver, AbstractManifoldSolver, OrthogonalProjection, SelectedStates, unrolled
 
 
 # Numbers on the tape, at most; beyond that diffrax's checkpoints.
@@ -39,6 +39,8 @@ def can_be_taped(solve: Any, size: int) -> bool:
 
 def _remembers_nothing(solver: Any) -> bool:
     """Whether the solver's state can be made anew at each step's start."""
+    if isinstance(solver, SelectedStates):
+        return False
     if isinstance(solver, OrthogonalProjection):
         return _remembers_nothing(solver.solver)
     return isinstance(solver, AbstractManifoldSolver | AbstractImplicitSolver) or hasattr(

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from .constraints import ManifoldODE, MechanicalODE, at_one_instant
@@ -19,7 +20,11 @@ from .taylor import total_derivatives
 
 
 # Gauss–Newton's method for the derivatives of the initial state.
-STARTING = 20
+STARTING = 100
+# How much more the derivatives may move there than the values: these are what is given.
+FREE = 1e3
+# A selection of states is kept until its smallest pivot is less than this part of the best one's.
+HYSTERESIS = 0.3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -200,12 +205,46 @@ class StructuralODE(ManifoldODE):
         mu, found = implicit_root(residual, iterate, (self, t, y, normals))
         return self.shift(y, normals, mu), found
 
+    def selection(self, t: Any, y: Any, chosen: Any) -> tuple[Float[Array, "m N"], Bool[Array, ""]]:
+        """Unit directions of the dummy derivatives, entries of Y that H = 0 determines given the others, and whether they
+        are not `chosen`.
+
+        Level by level, from the highest: the equations with Cᵢ ≥ k determine the derivatives of order Dⱼ − k of as many
+        variables, taken by complete pivoting on the system Jacobian from those that the level before has taken.
+        """
+        d = np.array(self.orders.variables)
+        matrix = lax.stop_gradient(self._system(t, y, None)[0])
+        largest = jnp.max(jnp.abs(matrix), 1, keepdims=True)
+        matrix = matrix / jnp.where(largest > 0, largest, 1)
+        infinite = jnp.asarray(jnp.inf, y.dtype)
+        available, quality, present, first, directions = jnp.ones(len(d), y.dtype), infinite, infinite, 0, []
+        for k in range(1, max(self.orders.equations) + 1):
+            rows = self.orders.rows(k - 1)
+            # Where in Y the derivative of order Dⱼ − k of each variable is.
+            place = np.array([self.orders.places[max(d[j] - k, 0)][j] if d[j] >= k else -1 for j in range(len(d))])
+            level = jnp.stack([matrix[i] for i in rows]) * (d >= k)
+            taken, smallest = _pivots(level * available)
+            quality, available = jnp.minimum(quality, smallest), jnp.sum(taken, 0)
+            embedding = np.zeros((len(d), y.size))
+            embedding[place >= 0, place[place >= 0]] = 1
+            directions.append(jnp.sum(taken[:, :, None] * embedding, 1))
+            if chosen is not None:
+                _, smallest = _pivots(level * take(jnp.sum(chosen[first : first + len(rows)], 0), place))
+                present = jnp.minimum(present, smallest)
+            first += len(rows)
+        best = jnp.concatenate(directions) if directions else jnp.zeros((0, y.size), y.dtype)
+        if chosen is None or not directions:
+            return best, jnp.asarray(False)
+        keep = present >= HYSTERESIS * quality
+        return jnp.where(keep, chosen, best), ~keep
+
     # The user's state
 
     def decode(self, t: Any, y: Any) -> Any:
-        if 0 not in self.orders.variables:
-            return self.form.decode(t, take(y, self.orders.places[0]))
-        return self.form.decode(t, take(jnp.concatenate([y, self.highest(t, y)]), self.orders.places[0]))
+        count = self.form.layout.size
+        algebraic = 0 in self.orders.variables[:count]
+        both = jnp.concatenate([y, self.highest(t, y)]) if algebraic else y
+        return self.form.decode(t, take(both, self.orders.places[0][:count]))
 
     def encode(self, t: Any, state: Any) -> Float[Array, " N"]:
         """Y of a state: the derivatives of order 1 and higher are those with which the equations hold, or nearly hold."""
@@ -220,33 +259,64 @@ class StructuralODE(ManifoldODE):
         return _nearest(self, t, take(values, index), weights)
 
 
-# How much more the derivatives may move than the values: these are what is given.
-FREE = 1e3
-
-
 def _nearest(ode: StructuralODE, t: Any, known: Any, weights: Any) -> Any:
     if not any(ode.orders.equations):
         return known
 
-    def improved(y: Any, params: Any) -> Any:
-        ode, t, known, weights = params
+    def moved(y: Any, start: Any, params: Any) -> Any:
+        """The point next to `start` on the linearisation of H = 0 at y."""
+        ode, t, _, weights, *_ = params
         a, h = ode.normals(t, y), ode.violations(t, y)
         largest = jnp.max(jnp.abs(a * weights), 1)
         scale = 1 / jnp.where(largest > 0, largest, 1)
-        a, off = a * scale[:, None], scale * (h + jnp.sum(a * (known - y), 1))
+        a, off = a * scale[:, None], scale * (h + jnp.sum(a * (start - y), 1))
         gram = jnp.sum((a * weights)[:, None] * (a * weights), -1)
         # What the free entries cannot mend stays as it is, in place of growing without bound.
         cut = 100 * jnp.finfo(y.dtype).eps * jnp.maximum(jnp.trace(gram), 1)
-        return known - weights**2 * jnp.sum(a * solve(gram + cut * jnp.eye(len(h), dtype=y.dtype), off)[:, None], 0)
+        return start - weights**2 * jnp.sum(a * solve(gram + cut * jnp.eye(len(h), dtype=y.dtype), off)[:, None], 0)
 
-    def iterate(params: Any) -> Any:
+    def settled(params: Any, y: Any, towards: Any) -> Any:
         def correct(y: Any) -> Any:
-            new = improved(y, params)
+            new = moved(y, towards(y), params)
             return new, relative_change(new - y, y)
 
-        return fixed_point(correct, correct(params[2]), STARTING)
+        return fixed_point(correct, correct(y), STARTING)
 
-    return implicit_root(lambda y, p: y - improved(y, p), iterate, (ode, t, known, weights))[0]
+    # Derivatives have nothing to be near to but what the equations make of them; the rest of a pull keeps those that the
+    # equations leave open from being undetermined.
+    is_value = ode.orders.values >= 0
+    pull = jnp.finfo(known.dtype).eps ** 0.6
+    aim = lambda y, params: jnp.where(is_value, params[2], y - pull * (y - params[4]))
+
+    def iterate(params: Any) -> Any:
+        # The nearest point, then what `cut` has left of H there.
+        near, _ = settled(params, params[4], lambda y: aim(y, params))
+        return settled(params, near, lambda y: y)
+
+    first, _ = settled((ode, t, known, weights), known, lambda y: jnp.where(is_value, known, y))
+    params = (ode, t, known, weights, lax.stop_gradient(first))
+    return implicit_root(lambda y, p: y - moved(y, aim(y, p), p), iterate, params)[0]
+
+
+def _pivots(a: Float[Array, "m N"]) -> tuple[Float[Array, "m N"], Float[Array, ""]]:
+    """The columns that elimination with complete pivoting takes, as unit rows, and the smallest pivot."""
+    m, n = a.shape
+
+    def eliminate(k: Any, carry: Any) -> Any:
+        a, taken, smallest = carry
+        place = jnp.argmax(jnp.abs(a).reshape(-1))
+        at_row, at_column = (jnp.arange(m) == place // n)[:, None], jnp.arange(n) == place % n
+        row = jnp.sum(jnp.where(at_row, a, 0), 0)
+        column = jnp.sum(jnp.where(at_column, a, 0), 1, keepdims=True)
+        pivot = jnp.sum(jnp.where(at_column, row, 0))
+        reduced = a - column * (row / jnp.where(pivot == 0, 1, pivot))
+        a = jnp.where(at_row | at_column, 0, reduced)
+        taken = jnp.where((jnp.arange(m) == k)[:, None], jnp.where(at_column, 1, 0).astype(a.dtype), taken)
+        return a, taken, jnp.minimum(smallest, jnp.abs(pivot))
+
+    infinite = jnp.asarray(jnp.inf, a.dtype)
+    _, taken, smallest = lax.fori_loop(0, m, eliminate, (a, jnp.zeros_like(a), infinite))
+    return taken, smallest
 
 
 def underlying_ode(system: Any, t: Any, state: Any, args: Any, rank: int | None = None) -> tuple[Any, ManifoldODE]:

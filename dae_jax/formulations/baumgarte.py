@@ -16,7 +16,8 @@ class Baumgarte(AbstractFormulation):
         g̈ + 2α ġ + β² g = 0    in place of   g̈ = 0,
 
     and ḣ + α h = 0 for nonholonomic constraints. Errors decay like exp(s t) with s² + 2αs + β² = 0: critically damped
-    for α = β. Large values are stiff for an explicit solver.
+    for α = β. Large values are stiff for an explicit solver. An equation of another system that has to be differentiated
+    c times gets the factor (d²/dt² + 2α d/dt + β²) c/2 times over, and (d/dt + α) for an odd c.
 
     **Arguments**
 
@@ -43,7 +44,9 @@ class Baumgarte(AbstractFormulation):
 
     def __call__(self, *levels: Float[Array, " m"]) -> Any:
         """What is added to the highest derivative of a constraint, given the constraint and its lower derivatives."""
-        if len(levels) == 1:
-            return self.alpha * levels[0]
-        g, dg = levels
-        return 2 * self.alpha * dg + self.beta**2 * g
+        polynomial = jnp.ones(1, jnp.result_type(*levels))
+        for _ in range(len(levels) // 2):
+            polynomial = jnp.convolve(polynomial, jnp.stack([jnp.ones_like(self.alpha), 2 * self.alpha, self.beta**2]))
+        if len(levels) % 2:
+            polynomial = jnp.convolve(polynomial, jnp.stack([jnp.ones_like(self.alpha), self.alpha]))
+        return sum(c * level for c, level in zip(polynomial[:0:-1], levels, strict=True))

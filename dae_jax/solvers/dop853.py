@@ -73,7 +73,7 @@ class DOP853(diffrax.AbstractAdaptiveSolver):
         flat = Flat(terms, y0, args, land)
         increment = lambda t, y: h * flat.field(t, y)
         k0 = h * first_derivative(flat, t0, state, made_jump)
-        ks = increments(_ROWS[: STAGES - 1], coefficients.C[1:STAGES], increment, t0, t1, flat.y0, k0)
+        ks = increments(_ROWS[: STAGES - 1], coefficients.C[1:STAGES], increment, t0, t1, flat.y0, k0, flat.looped)
         y1, found = flat.land(t1, combine(coefficients.B, ks, flat.y0))
         f1 = flat.field(t1, y1)
         ks.append(h * f1)

@@ -29,10 +29,20 @@ def combine(coefficients: Sequence[float] | np.ndarray, stages: Sequence[Any], y
 
 
 def increments(
-    a: Sequence[np.ndarray], c: np.ndarray, vector: Callable[[Any, Any], Any], t0: Any, t1: Any, y0: Any, k0: Any
+    a: Sequence[np.ndarray],
+    c: np.ndarray,
+    vector: Callable[[Any, Any], Any],
+    t0: Any,
+    t1: Any,
+    y0: Any,
+    k0: Any,
+    looped: bool,
 ) -> list[Any]:
-    """kᵢ = h f(t₀ + cᵢ h, y₀ + Σ aᵢⱼ kⱼ) for an explicit tableau; `vector(t, y)` is h f, `k0` the first."""
-    if y0.size > UNROLLED:
+    """kᵢ = h f(t₀ + cᵢ h, y₀ + Σ aᵢⱼ kⱼ) for an explicit tableau; `vector(t, y)` is h f, `k0` the first.
+
+    `looped`: the stages in a loop in place of one after the other.
+    """
+    if looped:
         return _increments_in_a_loop(a, c, vector, t0, t1, y0, k0)
     ks = [k0]
     for row, ci in zip(a, c, strict=True):
@@ -62,6 +72,7 @@ class Flat:
         self.y0, self.tree = ravel_pytree(y0)
         self.field = subroutine(scalarise(lambda t, y: self.vector(terms.vf(t, self.tree(y), args))))
         self._land = land
+        self.looped = self.y0.size > UNROLLED or getattr(terms, "looped", False)
 
     @staticmethod
     def vector(tree: Any) -> Any:
@@ -124,12 +135,12 @@ class Unrolled(diffrax.AbstractWrappedSolver):
         rows, nodes = tableau.a_lower, tableau.c
         f1 = None
         if tableau.fsal:
-            ks = increments(rows[:-1], nodes[:-1], increment, t0, t1, flat.y0, k0)
+            ks = increments(rows[:-1], nodes[:-1], increment, t0, t1, flat.y0, k0, flat.looped)
             y1, found = flat.land(t1, combine(rows[-1], ks, flat.y0))
             f1 = flat.field(t1, y1)
             ks.append(h * f1)
         else:
-            ks = increments(rows, nodes, increment, t0, t1, flat.y0, k0)
+            ks = increments(rows, nodes, increment, t0, t1, flat.y0, k0, flat.looped)
             y1, found = flat.land(t1, combine(tableau.b_sol, ks, flat.y0))
         error = flat.tree(combine(tableau.b_error, ks)) if np.any(tableau.b_error) else None
         dense = {"y0": y0, "y1": flat.tree(y1), "k": jax.tree.map(lambda *k: jnp.stack(k), *map(flat.tree, ks))}

@@ -78,14 +78,20 @@ class TangentSpace(AbstractManifoldSolver, diffrax.AbstractAdaptiveSolver):
         return terms.vf(t0, y0, args)
 
     def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any) -> Any:
+        chart = args.normals(clock(terms, t0, t1) * t0, y0)
+        return self.step_in(chart, terms, t0, t1, y0, args, solver_state, made_jump)
+
+    def step_in(
+        self, chart: Any, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, derivative: Any, made_jump: Any
+    ) -> Any:
+        """The step in the chart in which a point moves along `chart` on to the manifold; `derivative` is ẏ at y₀."""
         sign = clock(terms, t0, t1)
-        chart = args.normals(sign * t0, y0)
         solver = unrolled(self.solver)
         assert isinstance(solver, Unrolled) or hasattr(solver, "landing_step")
 
         # The end of the step is the lift of the last stage's point; its derivative is the next step's first.
         tangent_term = diffrax.ODETerm(lambda t, u, _: _field(terms, sign, args, chart, t, u)[0])
-        first = args.tangent(solver_state, chart) if made_jump is False else None
+        first = args.tangent(derivative, chart) if made_jump is False else None
         first = tangent_term.vf(t0, y0, None) if first is None else first
         wrapped = _Controlled(tangent_term, terms)
         u1, error, dense, _, _ = solver.landing_step(wrapped, t0, t1, y0, None, first, False, lambda t, u: (u, True))
@@ -103,10 +109,11 @@ class TangentSpace(AbstractManifoldSolver, diffrax.AbstractAdaptiveSolver):
 
 
 class _Controlled(eqx.Module):
-    """The field in the chart with the step of the outer term."""
+    """The field in the chart with the step of the outer term. It is a large program: the stages are looped."""
 
     term: diffrax.ODETerm
     outer: Any
+    looped: bool = eqx.field(static=True, default=True)
 
     def vf(self, t: Any, y: Any, args: Any) -> Any:
         return self.term.vf(t, y, args)
