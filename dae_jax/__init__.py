@@ -18,6 +18,7 @@ from .kernels import configure as configure
 from .solution import RESULTS as RESULTS, DAESolution as DAESolution
 from .solve import daesolve as daesolve
 from .solvers import (
+    BDF as BDF,
     DOP853 as DOP853,
     RATTLE as RATTLE,
     Gauss4 as Gauss4,

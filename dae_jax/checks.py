@@ -12,7 +12,7 @@ from .constraints import MechanicalODE
 from .formulations import AbstractFormulation, Differentiation, DummyDerivatives, Residual, StateSpace
 from .initialise import redundancy, unsolved, violation
 from .normals import SparseNormals
-from .solvers import RATTLE, AbstractManifoldSolver, RadauIIA5, unrolled
+from .solvers import RATTLE, AbstractManifoldSolver, AbstractResidualSolver, unrolled
 from .systems import ConstrainedSystem, ImplicitDAE, SemiExplicitDAE
 
 
@@ -146,7 +146,7 @@ def refuse_bad_times(saveat: Any, t0: Any, t1: Any) -> None:
 
 def takes_residuals(solver: Any) -> bool:
     """Whether a solver works on 0 = F(t, y, ẏ) in place of an ODE."""
-    return isinstance(solver, RadauIIA5)
+    return isinstance(solver, AbstractResidualSolver)
 
 
 def refuse_bad_start(system: Any, t0: Any, y0: Any, args: Any) -> int | None:

@@ -271,10 +271,12 @@ def _fitted(controller: Any, t0: Any, t1: Any) -> Any:
 
 def _of_residuals(solver: Any, controller: Any) -> tuple[Any, Any]:
     """A solver with the controller's tolerances; it finds by itself where time resolves no smaller step."""
-    if type(controller) is not diffrax.PIDController:
+    if not isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
         return solver, controller
     rtol, atol = (getattr(solver, name) or getattr(controller, name) for name in ("rtol", "atol"))
-    return dataclasses.replace(solver, rtol=rtol, atol=atol), dataclasses.replace(controller, dtmin=None)
+    if type(controller) is diffrax.PIDController:
+        controller = dataclasses.replace(controller, dtmin=None)
+    return dataclasses.replace(solver, rtol=rtol, atol=atol), controller
 
 
 def _uniform(solver: Any, path: diffrax.DenseInterpolation) -> diffrax.DenseInterpolation:

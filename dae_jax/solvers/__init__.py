@@ -1,5 +1,6 @@
 """How one step is taken: one file a method, each a diffrax solver."""
 
+from .bdf import BDF as BDF
 from .dop853 import DOP853 as DOP853
 from .explicit import unrolled as unrolled
 from .gauss import Gauss4 as Gauss4
@@ -9,7 +10,7 @@ from .midpoint import Midpoint as Midpoint
 from .orthogonal_projection import OrthogonalProjection as OrthogonalProjection
 from .radau import RadauIIA5 as RadauIIA5
 from .rattle import RATTLE as RATTLE
-from .residual_steps import first_step as first_step
+from .residual_steps import AbstractResidualSolver as AbstractResidualSolver, first_step as first_step
 from .selected_states import SelectedStates as SelectedStates
 from .symmetric_projection import SymmetricProjection as SymmetricProjection
 from .tangent_space import TangentSpace as TangentSpace

@@ -8,10 +8,19 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from ..linalg import implicit_root, rms_norm
+from ..linalg import implicit_root
 from .manifold import clock
 from .radau_coefficients import ALPHA, BACK, BETA, ERROR, GAMMA, INVERSE, NODES, POLYNOMIAL, TRANSFORM
-from .residual_steps import Tolerances, at_the_floor, constant, of_step, tolerances
+from .residual_steps import (
+    AbstractResidualSolver,
+    Tolerances,
+    at_the_floor,
+    constant,
+    not_begun,
+    of_step,
+    simplified_newton,
+    tolerances,
+)
 
 
 # The Jacobian is kept for the next step while Newton's method contracts faster than this.
@@ -107,17 +116,7 @@ class _Step(NamedTuple):
         return -jnp.stack(_combined(TRANSFORM, [w, jnp.real(v), jnp.imag(v)]))
 
 
-class _Newton(NamedTuple):
-    z: Any
-    count: Any
-    last: Any
-    eta: Any
-    theta: Any
-    converged: Any
-    diverged: Any
-
-
-class RadauIIA5(diffrax.AbstractAdaptiveSolver):
+class RadauIIA5(AbstractResidualSolver):
     """The Radau IIA method with three stages: order 5, stiffly accurate, L-stable, for 0 = F(t, y, ẏ) of index 0 to 3.
 
         0 = F(t₀ + cᵢ h, Yᵢ, Kᵢ),   Yᵢ = y₀ + h Σ aᵢⱼ Kⱼ,   y₁ = Y₃.
@@ -138,10 +137,6 @@ class RadauIIA5(diffrax.AbstractAdaptiveSolver):
     Methods*, table 2.3, for the orders.
     """
 
-    rtol: Any = None
-    atol: Any = None
-
-    term_structure = diffrax.ODETerm
     interpolation_cls = CollocationPolynomial
 
     def order(self, terms: Any) -> int:
@@ -149,9 +144,6 @@ class RadauIIA5(diffrax.AbstractAdaptiveSolver):
 
     def error_order(self, terms: Any) -> int:
         return 4
-
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
-        return terms.vf(t0, y0, args)
 
     def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> _State:
         sign = clock(terms, t0, t1)
@@ -212,42 +204,23 @@ def _solve(step: _Step, state: _State, tol: Tolerances) -> Any:
         factors, pivot = lax.cond(
             renew | (h != state.factored), lambda: step.factor(jacobians), lambda: (factors, infinite)
         )
-        return tries + 1, fresh | renew, _newton(step, factors, start, scale, state.eta, tol), jacobians, factors, pivot
+        return (
+            tries + 1,
+            fresh | renew,
+            simplified_newton(lambda z: step.correction(factors, z), start, scale, state.eta, tol),
+            jacobians,
+            factors,
+            pivot,
+        )
 
     def again(carry: Any) -> Any:
         tries, fresh, newton, *_ = carry
         return (tries == 0) | (~newton.converged & ~fresh)
 
-    none = _Newton(start, 0, h, state.eta, h, jnp.asarray(False), jnp.asarray(False))
+    none = not_begun(start, state.eta)
     first = (0, jnp.asarray(False), none, state.jacobians, state.factors, h)
     _, _, newton, jacobians, factors, pivot = lax.while_loop(again, attempt, first)
-    return newton.z.T.reshape(-1), (newton._replace(z=None), jacobians, factors, pivot)
-
-
-def _newton(step: _Step, factors: Any, start: Any, scale: Any, eta: Any, tol: Tolerances) -> _Newton:
-    """Simplified Newton until what remains, θ/(1 − θ) ‖Δz‖, is small beside the tolerance (IV.8)."""
-    epsilon = jnp.finfo(start.dtype).eps
-
-    def unfinished(s: _Newton) -> Any:
-        return ~s.converged & ~s.diverged & (s.count < tol.corrections)
-
-    def correct(s: _Newton) -> _Newton:
-        dz = step.correction(factors, s.z)
-        size = rms_norm(dz * scale)
-        theta = size / jnp.maximum(s.last, jnp.finfo(start.dtype).tiny)
-        first = s.count == 0
-        eta = jnp.where(first, jnp.maximum(s.eta, epsilon) ** 0.8, theta / jnp.maximum(1 - theta, epsilon))
-        remaining = tol.corrections - 1 - s.count
-        hopeless = (theta >= 1) | (eta * size * theta**remaining > tol.newton)
-        # A correction that does not shrink any more but is small is round-off.
-        converged = (eta * size <= tol.newton) & (first | (theta < 1)) | (size <= tol.roundoff)
-        diverged = ~jnp.isfinite(size) | (~first & hopeless & ~converged & (not tol.patient))
-        theta = jnp.where(first, 0, theta)
-        return _Newton(s.z + dz, s.count + 1, size, eta, theta, converged & jnp.isfinite(size), diverged)
-
-    no = jnp.asarray(False)
-    zero = jnp.zeros((), start.dtype)
-    return lax.while_loop(unfinished, correct, _Newton(start, 0, zero, eta, zero, no, no))
+    return newton.x.T.reshape(-1), (newton._replace(x=None), jacobians, factors, pivot)
 
 
 def _error(step: _Step, factor: Any, z: Any, tol: Tolerances) -> Float[Array, " n"]:

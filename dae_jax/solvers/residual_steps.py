@@ -1,5 +1,6 @@
-"""What the solvers of residuals have in common: tolerances, and what becomes of a step that failed."""
+"""What the solvers of residuals have in common: tolerances, Newton's method, and what becomes of a step that failed."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
@@ -10,6 +11,20 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..linalg import rms_norm, roundoff
+
+
+class AbstractResidualSolver(diffrax.AbstractAdaptiveSolver):
+    """A solver of 0 = F(t, y, ẏ); needs a `Pencil` as `args`. `rtol`, `atol`: the tolerances that Newton's method is fitted
+    to; by default those of the step-size controller, and round-off for fixed steps.
+    """
+
+    rtol: Any = None
+    atol: Any = None
+
+    term_structure = diffrax.ODETerm
+
+    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+        return terms.vf(t0, y0, args)
 
 
 class Tolerances(NamedTuple):
@@ -53,6 +68,53 @@ def tolerances(rtol: Any, atol: Any, dtype: Any) -> Tolerances:
         50 if patient else 10,
         patient,
     )
+
+
+class Newton(NamedTuple):
+    """An iteration that ended, or has yet to begin: the solution `x`, the number of corrections, the size of the last
+    one, η = θ/(1 − θ) and θ, the rate at which they shrink.
+    """
+
+    x: Any
+    count: Any
+    last: Any
+    eta: Any
+    theta: Any
+    converged: Any
+    diverged: Any
+
+
+def not_begun(start: Any, eta: Any) -> Newton:
+    """The iteration before its first correction."""
+    zero, no = jnp.zeros((), start.dtype), jnp.asarray(False)
+    return Newton(start, 0, zero, eta, zero, no, no)
+
+
+def simplified_newton(correction: Callable[[Any], Any], start: Any, scale: Any, eta: Any, tol: Tolerances) -> Newton:
+    """Corrects `start` until what remains, η ‖Δx‖, is small beside the tolerance; ‖Δx‖ is that of Δx · `scale`.
+
+    Source: E. Hairer, G. Wanner, *Solving Ordinary Differential Equations II*, section IV.8.
+    """
+    epsilon = jnp.finfo(start.dtype).eps
+
+    def goes_on(s: Newton) -> Any:
+        return ~s.converged & ~s.diverged & (s.count < tol.corrections)
+
+    def correct(s: Newton) -> Newton:
+        dx = correction(s.x)
+        size = rms_norm(dx * scale)
+        theta = size / jnp.maximum(s.last, jnp.finfo(start.dtype).tiny)
+        first = s.count == 0
+        eta = jnp.where(first, jnp.maximum(s.eta, epsilon) ** 0.8, theta / jnp.maximum(1 - theta, epsilon))
+        remaining = tol.corrections - 1 - s.count
+        hopeless = (theta >= 1) | (eta * size * theta**remaining > tol.newton)
+        # A correction that does not shrink any more but is small is round-off.
+        converged = (eta * size <= tol.newton) & (first | (theta < 1)) | (size <= tol.roundoff)
+        diverged = ~jnp.isfinite(size) | (~first & hopeless & ~converged & (not tol.patient))
+        theta = jnp.where(first, 0, theta)
+        return Newton(s.x + dx, s.count + 1, size, eta, theta, converged & jnp.isfinite(size), diverged)
+
+    return lax.while_loop(goes_on, correct, not_begun(start, eta))
 
 
 class Failure(NamedTuple):

@@ -1,0 +1,278 @@
+"""Backward differentiation formulas of order 1 to 5 with variable steps for 0 = F(t, y, ẏ)."""
+
+import functools
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from ..linalg import implicit_root, rms_norm
+from .manifold import clock
+from .residual_steps import (
+    AbstractResidualSolver,
+    Tolerances,
+    at_the_floor,
+    constant,
+    not_begun,
+    of_step,
+    simplified_newton,
+    tolerances,
+)
+
+
+MAX_ORDER = 5
+ROWS = range(MAX_ORDER + 1)
+# The factors of the iteration matrix are kept while its c is within this factor of theirs.
+KEPT = 0.6
+# The part of the step-size controller in h_new = h · SAFETY · error^(−1 / ERROR_ORDER).
+SAFETY, ERROR_ORDER = 0.9, 2
+
+
+class NewtonPolynomial(diffrax.AbstractLocalInterpolation):
+    """Σ φⱼ Πᵢ (t − tₙ₋ᵢ)/ψᵢ₊₁, i < j: the polynomial through the last points that the step's formula has used."""
+
+    t0: Any
+    t1: Any
+    phi: Any
+    psi: Any
+
+    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Any:
+        """The value at `t0`, or the increment from there to `t1`."""
+        if t1 is not None:
+            return self.evaluate(t1) - self.evaluate(t0)
+        psi = jnp.where(self.psi == 0, 1, self.psi)
+        y = self.phi[MAX_ORDER]
+        for j in reversed(range(MAX_ORDER)):
+            distance = t0 - self.t1 + (self.psi[j - 1] if j else 0)
+            y = self.phi[j] + distance / psi[j] * y
+        return y
+
+
+class _State(NamedTuple):
+    """What a step leaves to the next.
+
+    `phi`: modified divided differences φ₁ ... φ₅ at tₙ; `psi`: tₙ − tₙ₋₁, tₙ − tₙ₋₂, ...; `steps`: how many were taken since
+    the start or a jump; `order` of the next step; `used`: that of the last; `alike`: how many steps had this size and
+    order; `rising`: the order has risen with every step so far; `factors` of ∂F/∂y + c ∂F/∂ẏ, and the c they were made
+    for; `eta`: θ/(1 − θ) of Newton's method.
+    """
+
+    phi: Float[Array, "5 n"]
+    psi: Float[Array, " 6"]
+    steps: Int[Array, ""]
+    order: Int[Array, ""]
+    used: Int[Array, ""]
+    alike: Int[Array, ""]
+    rising: Bool[Array, ""]
+    factors: Any
+    c: Float[Array, ""]
+    eta: Float[Array, ""]
+
+
+class _Step(NamedTuple):
+    """The equation of a step, 0 = F(t₁, y, ẏ*+ c (y − y*)): a pytree, so that it can be differentiated."""
+
+    pencil: Any
+    sign: Any
+    t1: Any
+    h: Any
+    c: Any
+    y: Float[Array, " n"]
+    rate: Float[Array, " n"]
+
+    def residual(self, y: Float[Array, " n"]) -> Float[Array, " n"]:
+        """F at the new point."""
+        return self.pencil.residual(self.sign * self.t1, y, self.sign * (self.rate + self.c * (y - self.y)))
+
+    def factor(self, y: Float[Array, " n"]) -> tuple[Any, Float[Array, ""]]:
+        """The factors of ∂F/∂y + c ∂F/∂ẏ, and the smallest pivot."""
+        j, m = self.pencil.jacobians(self.sign * self.t1, y, self.sign * (self.rate + self.c * (y - self.y)))
+        return self.pencil.factor(j, m, self.sign * self.c, self.h)
+
+
+class BDF(AbstractResidualSolver):
+    """The backward differentiation formulas of order 1 to 5 for 0 = F(t, y, ẏ), of variable step and order.
+
+    The polynomial y* of degree k through the last k + 1 points predicts y and ẏ at t₁; the solution's polynomial goes
+    through (t₁, y) and the points of y* at t₁ − h, ..., t₁ − k h, so that
+
+        0 = F(t₁, y, ẏ* + c (y − y*)),   c = (1 + 1/2 + ... + 1/k)/h
+
+    (fixed leading coefficient). Simplified Newton from y*; its matrix is kept while c changes little. The error is
+    estimated by y − y*, also for the orders k − 2, k − 1 and k + 1, from which the next order and step size follow.
+
+    For index 0 and 1, index 2 in the GGL form and as "index-2"; errors of variables of index k count with h^(k−1).
+
+    **Arguments**
+
+    - `rtol`, `atol`: by default those of the step-size controller, which must not differ.
+
+    The step size follows from the order, so it is the solver that finds it, and the error it returns is the one from
+    which a `diffrax.PIDController` with its default coefficients finds the same.
+
+    Source: K. E. Brenan, S. L. Campbell, L. R. Petzold, *Numerical Solution of Initial-Value Problems in
+    Differential-Algebraic Equations*, chapter 5; A. C. Hindmarsh et al., *SUNDIALS*, ACM Trans. Math. Softw. 31 (2005),
+    363–396, for the choice of the order.
+    """
+
+    interpolation_cls = NewtonPolynomial
+
+    def order(self, terms: Any) -> int:
+        return MAX_ORDER
+
+    def error_order(self, terms: Any) -> int:
+        return ERROR_ORDER
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> _State:
+        sign = clock(terms, t0, t1)
+        like = _Step(args, sign, t1, t1 - t0, 1 / (t1 - t0), y0, y0)
+        factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda: like.factor(y0)[0]))
+        return _start(args, sign, t0, y0, factors)
+
+    def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: _State, made_jump: Any) -> Any:
+        # A lane of a batch that has ended goes on with steps of length 0, whose derivatives are multiplied by 0.
+        h = jnp.where(t1 == t0, 1, t1 - t0)
+        sign, state = clock(terms, t0, t1), solver_state
+        if made_jump is not False:
+            state = lax.cond(made_jump, lambda: _start(args, sign, t0, y0, state.factors), lambda: state)
+        tol = tolerances(self.rtol, self.atol, y0.dtype)
+        k, method = state.order, _formula(state, h)
+        star = [y0] + [b * row for b, row in zip(method.beta[1:], state.phi, strict=True)]
+        y = sum(jnp.where(j <= k, row, 0) for j, row in enumerate(star))
+        rate = sum(jnp.where(j <= k, g * row, 0) for j, (g, row) in enumerate(zip(method.gamma, star, strict=True)))
+        y1, (newton, factors, c, pivot) = implicit_root(
+            lambda y, params: params[0].residual(y),
+            lambda params: _solve(*params),
+            (_Step(args, sign, t1, h, method.c, y, rate), *constant((y0, state)), tol),
+            linear_solve=lambda inverse, b: inverse(b),
+            jacobian=lambda y, params: functools.partial(params[0].pencil.solve, params[0].factor(y)[0]),
+        )
+        # Row j of the new differences is the change and all rows from j to k; rows above k are not used yet, or are φₖ₊₁.
+        phi = [y1 - y]
+        for j in reversed(ROWS):
+            phi.append(jnp.where(j <= k, phi[-1] + star[j], phi[-1]))
+        change, *phi = [phi[0], *reversed(phi[1:])]
+
+        scale = args.weights(h) / tol.scale(y0, y1)
+        size = lambda row: rms_norm(constant(row * scale))
+        sizes = [size(row) for row in phi]
+        higher = size(change - _at(star, k + 1))
+        alike = jnp.where(method.constant & (k == state.used), state.alike, 0) + 1
+        decision = _decision(constant(method), state, alike, size(change), sizes, higher)
+        error = jnp.where(newton.converged, decision.error, jnp.inf) * tol.scale(y0, y1)
+        failure = of_step(newton.converged, pivot, y0.size, decision.error)
+        y1, error, result = at_the_floor(failure, t0, t1, y0, y1, constant(error))
+        phi = jnp.stack(phi)
+        new = _State(
+            phi[1:], method.psi, state.steps + 1, decision.order, k, alike, decision.rising,
+            *constant((factors, c, newton.eta)),
+        )  # fmt: skip
+        used = jnp.stack([jnp.where(j <= k, 1, 0) for j in ROWS])[:, None]
+        return y1, error, {"phi": jnp.where(used, phi, 0), "psi": method.psi}, new, result
+
+
+def _start(pencil: Any, sign: Any, t0: Any, y0: Any, factors: Any) -> _State:
+    """No history: φ₁ is dy/dτ, to be multiplied by the size of the first step. It predicts only."""
+    zero, count = jnp.zeros((), y0.dtype), jnp.zeros((), int)
+    rates = sign * constant(pencil.rates(sign * t0, y0))
+    phi = jnp.stack([rates] + [jnp.zeros_like(y0)] * (MAX_ORDER - 1))
+    return _State(
+        phi, jnp.ones(len(ROWS), y0.dtype), count, count + 1, count, count, count == 0, factors, zero, zero + 1
+    )
+
+
+class _Formula(NamedTuple):
+    """The coefficients of a step of order k: φ* = β φ, ẏ* = Σ γ φ*, c; the error is σ_k or, that of the interpolation
+    included, `tail` times y − y*. `psi` belongs to the new point; `constant`: the size is that of the last step.
+    """
+
+    beta: list[Any]
+    gamma: list[Any]
+    sigma: list[Any]
+    tail: Any
+    c: Any
+    psi: Any
+    constant: Any
+
+
+def _formula(state: _State, h: Any) -> _Formula:
+    k, first = state.order, state.steps == 0
+    old = [jnp.where(first, (j + 1) * h, state.psi[j]) for j in ROWS]
+    new = [h] + [x + h for x in old[:-1]]
+    alpha = [h / x for x in new]
+    beta, gamma, sigma = [jnp.ones_like(h)], [jnp.zeros_like(h)], [jnp.ones_like(h)]
+    for j in ROWS[1:]:
+        beta.append(beta[-1] * (new[j - 1] / old[j - 1]))
+        gamma.append(gamma[-1] + 1 / new[j - 1])
+        sigma.append(sigma[-1] * j * alpha[j])
+    # φ₁ of a start is a derivative.
+    beta = [beta[0]] + [jnp.where(first, h, b) for b in beta[1:]]
+    leading = sum(jnp.where(j <= k, 1 / j, 0) for j in ROWS[1:])
+    variable = sum(jnp.where(j < k, alpha[j], 0) for j in ROWS)
+    tail = jnp.maximum(jnp.abs(_at(alpha, k) - leading + variable), _at(alpha, k))
+    constant_size = jnp.abs(h - old[0]) <= 1e-6 * h
+    return _Formula(beta, gamma, sigma, tail, leading / h, jnp.stack(new), constant_size)
+
+
+def _at(rows: list[Any], k: Any) -> Any:
+    """Row k; 0 outside."""
+    return sum(jnp.where(j == k, row, 0) for j, row in enumerate(rows))
+
+
+def _solve(step: _Step, y0: Any, state: _State, tol: Tolerances) -> Any:
+    """y at t₁, and how it was found: with the factors at hand first, with new ones where these fail."""
+    scale = step.pencil.weights(step.h) / tol.scale(y0)
+    far = (step.c < KEPT * state.c) | (state.c < KEPT * step.c)
+
+    def attempt(carry: Any) -> Any:
+        tries, fresh, _, factors, c, _ = carry
+        renew = (tries > 0) | far
+        factors, pivot = lax.cond(renew, lambda: step.factor(step.y), lambda: (factors, jnp.full_like(c, jnp.inf)))
+        c = jnp.where(renew, step.c, c)
+        # The factors are for another c: this damping makes up for it on average (BCP, section 5.2.3).
+        correction = lambda y: -2 / (1 + step.c / c) * step.pencil.solve(factors, step.residual(y))
+        newton = simplified_newton(correction, step.y, scale, jnp.where(renew, 1, state.eta), tol)
+        return tries + 1, fresh | renew, newton, factors, c, pivot
+
+    def again(carry: Any) -> Any:
+        tries, fresh, newton, *_ = carry
+        return (tries == 0) | (~newton.converged & ~fresh)
+
+    first = (0, jnp.asarray(False), not_begun(step.y, state.eta), state.factors, state.c, jnp.zeros_like(step.h))
+    _, _, newton, factors, c, pivot = lax.while_loop(again, attempt, first)
+    return jnp.where(newton.converged, newton.x, step.y), (newton._replace(x=None), factors, c, pivot)
+
+
+class _Decision(NamedTuple):
+    error: Any
+    order: Any
+    rising: Any
+
+
+def _decision(method: _Formula, state: _State, alike: Any, change: Any, sizes: list[Any], higher: Any) -> _Decision:
+    """The next order, that with the least term hʲ y⁽ʲ⁾ of the series, and the error that leads to the next size.
+
+    At the start, order and size rise with each step; later the order rises after k + 1 steps of one size and order, and
+    the size where it can be doubled.
+    """
+    k = state.order
+    errors = _at(method.sigma, k - 1) * _at(sizes, k), _at(method.sigma, k) * change, higher / (k + 2)
+    low, here, high = (error * (k + j) for j, error in enumerate(errors))
+    lowest = (k - 1) * _at(method.sigma, k - 2) * _at(sizes, k - 1)
+    falls = jnp.where(k > 2, jnp.maximum(low, lowest) <= here, (k == 2) & (low <= here / 2))
+    rising = state.rising & ~falls & (k < MAX_ORDER)
+    settled = ~rising & (alike > k + 1) & (k - state.used != 1) & (k < MAX_ORDER)
+    falls = falls | (settled & (k > 1) & (low <= jnp.minimum(here, high)))
+    rises = (settled & ~falls & (high < jnp.where(k == 1, here / 2, here))) | (rising & (state.steps > 0))
+    order = k + rises - falls
+    accepted = method.tail * change < 1
+    expected = jnp.where(accepted, _at(list(errors), order - k + 1), errors[1])
+    exponent = jnp.where(accepted, order, k) + 1
+    ratio = (2 * expected + 1e-4) ** (-1 / exponent)
+    # An accepted step is followed by one of its size exactly, or by one of twice its size.
+    double = (ratio >= 2) & ~rising | rising & rises
+    factor = jnp.where(accepted, jnp.where(double, 2, 0.95), jnp.clip(0.9 * ratio, 0.25, 0.89))
+    return _Decision((factor / SAFETY) ** -ERROR_ORDER, order, rising)
