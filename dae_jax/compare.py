@@ -14,10 +14,11 @@ import numpy as np
 
 from . import plotting
 from .diagnostics import drift, energy
-from .formulations import AbstractFormulation, Baumgarte, Residual, StateSpace
+from .formulations import AbstractFormulation, Baumgarte, DummyDerivatives, Residual, StateSpace
 from .scenes import Scene
 from .solve import daesolve
 from .solvers import (
+    BDF,
     DOP853,
     RATTLE,
     Gauss4,
@@ -40,9 +41,20 @@ class Method:
 
 
 def methods(scene: Scene) -> dict[str, Method]:
-    """The methods by their command-line names; the state-space form where the scene has a chart."""
+    """The methods by their command-line names that apply: the state-space form where the scene has a chart, explicit ones
+    where it is not stiff.
+    """
     if not isinstance(scene.system, ConstrainedSystem):
-        return {"radau": Method(RadauIIA5())}
+        implicit = {"radau": Method(RadauIIA5()), "bdf": Method(BDF())}
+        if scene.stiff:
+            return implicit
+        return implicit | {
+            "differentiation": Method(DOP853()),
+            "baumgarte": Method(DOP853(), Baumgarte(20.0, 20.0)),
+            "projection-dop853": Method(OrthogonalProjection(DOP853())),
+            "tangent-space": Method(TangentSpace(DOP853())),
+            "dummy-derivatives": Method(DOP853(), DummyDerivatives()),
+        }
     found = {
         "differentiation": Method(DOP853()),
         "differentiation-fixed": Method(diffrax.Tsit5(), step=0.02),
@@ -57,6 +69,8 @@ def methods(scene: Scene) -> dict[str, Method]:
         "radau-ggl": Method(RadauIIA5()),
         "radau-index-2": Method(RadauIIA5(), Residual("index-2")),
         "radau-index-3": Method(RadauIIA5(), Residual("index-3")),
+        "bdf-ggl": Method(BDF()),
+        "dummy-derivatives": Method(DOP853(), DummyDerivatives()),
     }
     if scene.chart is not None:
         found["state-space"] = Method(DOP853(), StateSpace(scene.chart))

@@ -150,6 +150,11 @@ class Pencil(eqx.Module):
 
         return jax.lax.fori_loop(0, GAUSS_NEWTON, improve, jnp.zeros_like(y))
 
+    @property
+    def controlled(self) -> np.ndarray:
+        """Which variables are of index 0 or 1."""
+        return np.array(self.outline.indices) <= 1
+
     def weights(self, h: Any) -> Float[Array, " n"]:
         """h^(k−1) for a variable of index k > 1: how much of its error counts.
 

@@ -74,6 +74,8 @@ def hindrances(jaxpr: ClosedJaxpr | Jaxpr) -> tuple[str, ...]:
 
 def _hinders(eqn: Any) -> bool:
     name = eqn.primitive.name
+    if eqn.effects:
+        return True
     if name.startswith("scatter"):
         # A single window is a dynamic update; several, as under `vmap`, are a loop that cannot be emitted.
         return math.prod(eqn.invars[1].aval.shape[:-1]) > 1

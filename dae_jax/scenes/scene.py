@@ -26,6 +26,7 @@ class Scene:
     - `index`: the differentiation index.
     - `scale`: the size below which a variable counts as zero: atol = scale · rtol, and errors are relative to the larger
       of it and the reference.
+    - `stiff`: explicit methods are out of the question.
     """
 
     name: str
@@ -38,6 +39,7 @@ class Scene:
     args: Any = None
     index: int = 3
     scale: float = 1.0
+    stiff: bool = False
 
     def error(self, times: np.ndarray, ys: Any) -> float:
         """The largest error of states at the given times, relative where the reference is larger than `scale`."""

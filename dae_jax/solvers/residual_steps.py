@@ -13,6 +13,10 @@ from jaxtyping import Array, Float
 from ..linalg import rms_norm, roundoff
 
 
+# The part of the tolerance that round-off may use up (BCP, section 5.2.2).
+NOISE = 0.33
+
+
 class AbstractResidualSolver(diffrax.AbstractAdaptiveSolver):
     """A solver of 0 = F(t, y, ẏ); needs a `Pencil` as `args`. `rtol`, `atol`: the tolerances that Newton's method is fitted
     to; by default those of the step-size controller, and round-off for fixed steps.
@@ -107,9 +111,10 @@ def simplified_newton(correction: Callable[[Any], Any], start: Any, scale: Any, 
         first = s.count == 0
         eta = jnp.where(first, jnp.maximum(s.eta, epsilon) ** 0.8, theta / jnp.maximum(1 - theta, epsilon))
         remaining = tol.corrections - 1 - s.count
-        hopeless = (theta >= 1) | (eta * size * theta**remaining > tol.newton)
+        stagnant = ~first & (theta >= 1)
+        hopeless = stagnant | (eta * size * theta**remaining > tol.newton) & (size > NOISE)
         # A correction that does not shrink any more but is small is round-off.
-        converged = (eta * size <= tol.newton) & (first | (theta < 1)) | (size <= tol.roundoff)
+        converged = (eta * size <= tol.newton) & ~stagnant | (size <= tol.roundoff) | (stagnant & (size <= NOISE))
         diverged = ~jnp.isfinite(size) | (~first & hopeless & ~converged & (not tol.patient))
         theta = jnp.where(first, 0, theta)
         return Newton(s.x + dx, s.count + 1, size, eta, theta, converged & jnp.isfinite(size), diverged)
