@@ -14,6 +14,7 @@ from .formulations import (
     StateSpace as StateSpace,
 )
 from .initialise import consistent_state as consistent_state
+from .jumps import Jump as Jump
 from .kernels import configure as configure
 from .solution import RESULTS as RESULTS, DAESolution as DAESolution
 from .solve import daesolve as daesolve

@@ -12,7 +12,7 @@ from .constraints import MechanicalODE
 from .formulations import AbstractFormulation, Differentiation, DummyDerivatives, Residual, StateSpace
 from .initialise import redundancy, unsolved, violation
 from .normals import SparseNormals
-from .solvers import RATTLE, AbstractManifoldSolver, AbstractResidualSolver, unrolled
+from .solvers import RATTLE, AbstractManifoldSolver, AbstractResidualSolver, TangentSpace, unrolled
 from .systems import ConstrainedSystem, ImplicitDAE, SemiExplicitDAE
 
 
@@ -109,6 +109,15 @@ def refuse_misfits(system: Any, formulation: Any, solver: Any, t0: Any, y0: Any,
         )
     if isinstance(solver, RATTLE):
         _fits_rattle(system, formulation, t0, y0, args)
+
+
+def refuse_no_event(solver: Any) -> None:
+    """Refuses solvers whose dense output diffrax cannot look for an event on."""
+    if isinstance(solver, TangentSpace):
+        raise ValueError(
+            "Events need a solution between steps in the coordinates of the step, which the local coordinates of TangentSpace "
+            "and DummyDerivatives are not; use OrthogonalProjection, RadauIIA5 or BDF."
+        )
 
 
 def _fits_rattle(system: ConstrainedSystem, formulation: Any, t0: Any, y0: Any, args: Any) -> None:

@@ -16,6 +16,7 @@ from .checks import is_saved_part, saved_parts
 from .constraints import MechanicalODE
 from .formulations import AbstractFormulation, Residual
 from .initialise import redundancy, unsolved, violation
+from .jumps import Jump, solve_with_jumps
 from .kernels import PullBack, inexact, one_kernel, one_kernel_enabled
 from .linalg import rms_norm
 from .solution import RESULTS, DAESolution, Interpolation, all_finite
@@ -67,7 +68,9 @@ class _Static(eqx.Module):
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def _jitted(program: Program, rank: int | None, arrays: list[Any]) -> Any:
     solve, *inputs = program.inputs(jax.tree.map(jnp.asarray, arrays))
-    sol, as_expected = solve(*inputs, rank)
+    sol, as_expected = (
+        (solve_with_jumps(solve, *inputs, rank)) if isinstance(solve.event, Jump) else solve(*inputs, rank)
+    )
     numbers, rest = eqx.partition(sol, eqx.is_array)
     return numbers, _Static(rest), as_expected
 
@@ -109,7 +112,7 @@ class Solve(eqx.Module):
     saveat: diffrax.SaveAt
     controller: diffrax.AbstractStepSizeController
     adjoint: diffrax.AbstractAdjoint
-    event: diffrax.Event | None
+    event: diffrax.Event | Jump | None
     max_steps: int | None = eqx.field(static=True)
     progress_meter: diffrax.AbstractProgressMeter
 

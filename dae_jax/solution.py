@@ -44,6 +44,10 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "without bound, or the tolerance is below round-off. Try a larger `atol`, a lower index (`dae_jax.analyse` shows "
         "it), or another method."
     )
+    too_many_jumps = (
+        "There were more jumps than `Jump(most=...)` allows: raise it, or look whether the jumps pile up at one time, as "
+        "those of a ball that comes to rest do."
+    )
 
 
 class Interpolation(eqx.Module):

@@ -7,8 +7,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .checks import as_array, checked, refuse_bad_start, refuse_bad_times, refuse_misfits, takes_residuals
+from .checks import (
+    as_array,
+    checked,
+    refuse_bad_start,
+    refuse_bad_times,
+    refuse_misfits,
+    refuse_no_event,
+    takes_residuals,
+)
 from .formulations import AbstractFormulation, Differentiation, DummyDerivatives, Residual
+from .jumps import Jump, refuse_other_outputs
 from .program import Program, Solve, run, split
 from .solution import RESULTS, DAESolution
 from .solvers import SelectedStates
@@ -31,7 +40,7 @@ def daesolve(
     saveat: diffrax.SaveAt = diffrax.SaveAt(t1=True),  # noqa: B008
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
     adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint(),  # noqa: B008
-    event: diffrax.Event | None = None,
+    event: diffrax.Event | Jump | None = None,
     max_steps: int | None = 4096,
     throw: bool = True,
     progress_meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter(),  # noqa: B008
@@ -51,8 +60,8 @@ def daesolve(
     - `stepsize_controller`: by default fixed steps if `dt0` is given, else `PIDController(rtol=1e-8, atol=1e-8)` (1e-5 in
       float32).
     - `saveat`, `adjoint`, `event`, `max_steps`, `throw`, `progress_meter`: as in diffrax. Functions in `saveat` and
-      `event` get the state in the structure of `y0`, and the user's `args`. Forward-mode derivatives need
-      `adjoint=diffrax.ForwardMode()`.
+      `event` get the state in the structure of `y0`, and the user's `args`. With a `Jump` as `event` the solve goes on
+      after it. Forward-mode derivatives need `adjoint=diffrax.ForwardMode()`.
 
     **Returns** a `DAESolution`.
 
@@ -87,6 +96,10 @@ def prepared(
         stepsize_controller = _default_controller(solver, dt0, dtype)
     t0, t1, dt0 = (x if x is None else as_array(x, dtype) for x in (t0, t1, dt0))
     saveat = jax.tree.map(lambda x: as_array(x, dtype) if isinstance(x, np.ndarray | jax.Array) else x, saveat)
+    if event is not None:
+        refuse_no_event(solver)
+    if isinstance(event, Jump):
+        refuse_other_outputs(saveat)
     solve = Solve(formulation, solver, saveat, stepsize_controller, adjoint, event, max_steps, progress_meter)
     return solve, system, t0, t1, dt0, y0, args
 

@@ -14,7 +14,7 @@ LAYERS = (
     {"kernels", "linalg", "progress", "structure"},
     {"constraints", "initialise", "normals", "pencil", "residual", "systems", "taylor", "underlying"},
     {"formulations", "solvers"},
-    {"analyse", "checks", "diagnostics", "explain", "program", "solution", "solve", "tape"},
+    {"analyse", "checks", "diagnostics", "explain", "jumps", "program", "solution", "solve", "tape"},
     {"baumgarte_loss", "compare", "maps", "plotting", "reductions", "scenes", "sweep", "sweep_store", "tune"},
     {"__main__", "cli"},
 )

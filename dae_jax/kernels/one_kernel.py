@@ -126,24 +126,44 @@ def _evaluate(jaxpr: Jaxpr, consts: Any, args: Any) -> list[Any]:
 
     for eqn in jaxpr.eqns:
         values = [read(v) for v in eqn.invars]
-        inner = _unchecked(eqn)
-        if inner is not None:
-            results = _evaluate(inner.jaxpr, inner.consts, values[len(values) - len(inner.jaxpr.invars) :])
-        else:
+        if not any(map(_is_check, _equations_in(eqn))):
             results = eqn.primitive.bind(*values, **eqn.primitive.get_bind_params(eqn.params))
             results = results if eqn.primitive.multiple_results else [results]
+        else:
+            results = _without_its_checks(eqn, values)
         env.update(zip(eqn.outvars, results, strict=True))
     return [read(v) for v in jaxpr.outvars]
 
 
+def _without_its_checks(eqn: Any, values: list[Any]) -> list[Any]:
+    """The results of an equation with checks in it."""
+    inner = _unchecked(eqn)
+    if inner is not None:
+        return _evaluate(inner.jaxpr, inner.consts, values[len(values) - len(inner.jaxpr.invars) :])
+    if eqn.primitive.name == "cond":
+        index, *operands = values
+        branches = [lambda *xs, b=b: _evaluate(b.jaxpr, b.consts, xs) for b in eqn.params["branches"]]
+        return jax.lax.switch(index, branches, *operands)
+    results = eqn.primitive.bind(*values, **eqn.primitive.get_bind_params(eqn.params))
+    return results if eqn.primitive.multiple_results else [results]
+
+
 def _unchecked(eqn: Any) -> ClosedJaxpr | None:
-    """What to run in place of an equation with a check in it; `None` if there is none."""
+    """What to run in place of a check, or of a call with checks in it; `None` for other equations."""
     name = eqn.primitive.name
-    if name not in ("jit", "pjit", "custom_jvp_call", "cond") or not any(map(_is_check, _equations_in(eqn))):
-        return None
     if name == "cond":
-        return next((b for b in eqn.params["branches"] if not any(map(_is_check, equations(b)))), None)
-    return eqn.params["call_jaxpr" if name == "custom_jvp_call" else "jaxpr"]
+        branches = eqn.params["branches"]
+        checked = [any(map(_is_check, b.jaxpr.eqns)) for b in branches]
+        return branches[checked.index(False)] if any(checked) and not all(checked) else None
+    if name in ("jit", "pjit"):
+        return eqn.params["jaxpr"]
+    if name == "custom_jvp_call" and any(map(_is_checking, eqn.params["call_jaxpr"].jaxpr.eqns)):
+        return eqn.params["call_jaxpr"]
+    return None
+
+
+def _is_checking(eqn: Any) -> bool:
+    return eqn.primitive.name == "cond" and _unchecked(eqn) is not None
 
 
 def _is_check(eqn: Any) -> bool:

@@ -1,0 +1,135 @@
+"""Solves that start again after an event: where it is, what comes after, derivatives and batches through it."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.special import ellipk
+
+import dae_jax
+from dae_jax.scenes import pendulum
+
+
+GRAVITY = 9.81
+# A ball on a vertical wire: x = 0.
+BALL = dae_jax.ConstrainedSystem(lambda t, q, v, e: jnp.array([0.0, -GRAVITY]), lambda t, q, e: q[0])
+RELEASED = (jnp.array([0.0, 1.0]), jnp.zeros(2))
+BOUNCE = dae_jax.Jump(lambda t, y, e, **_: y[0][1], lambda t, y, e: ((y[0], -e * y[1]), e), direction=False)
+
+
+def bouncing(e, t1, adjoint=None, solver=None, **options):
+    adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
+    solver = diffrax.Tsit5() if solver is None else solver
+    return dae_jax.daesolve(BALL, solver, 0.0, t1, None, RELEASED, e, event=BOUNCE, adjoint=adjoint, **options)
+
+
+def bounces(e):
+    """The times of the first three."""
+    fall = np.sqrt(2 / GRAVITY)
+    return fall * np.array([1, 1 + 2 * e, 1 + 2 * e + 2 * e**2])
+
+
+def height(e, t):
+    """Between the third bounce and the fourth."""
+    since = t - bounces(e)[2]
+    return e**3 * np.sqrt(2 * GRAVITY) * since - GRAVITY / 2 * since**2
+
+
+@pytest.mark.parametrize(
+    "solver", [diffrax.Tsit5(), dae_jax.OrthogonalProjection(dae_jax.DOP853()), dae_jax.RadauIIA5()]
+)
+def test_a_ball_bounces_when_it_should(solver):
+    sol = bouncing(0.9, 2.2, solver=solver, saveat=diffrax.SaveAt(t0=True, ts=np.array([0.3, 2.1]), t1=True))
+    assert sol.stats["jumps"] == 3
+    np.testing.assert_allclose(sol.stats["jump_times"][:3], bounces(0.9), atol=1e-9)
+    assert np.isinf(sol.stats["jump_times"][3:]).all()
+    np.testing.assert_array_equal(sol.ts, [0.0, 0.3, 2.1, 2.2])
+    exact = [1.0, 1 - GRAVITY / 2 * 0.09, height(0.9, 2.1), height(0.9, 2.2)]
+    np.testing.assert_allclose(sol.ys[0][:, 1], exact, atol=1e-8)
+
+
+def test_derivatives_through_jumps():
+    end = lambda e, adjoint: bouncing(e, 2.2, adjoint).ys[0][-1, 1]
+    h = 1e-6
+    exact = (height(0.9 + h, 2.2) - height(0.9 - h, 2.2)) / (2 * h)
+    reverse = jax.grad(lambda e: end(e, diffrax.RecursiveCheckpointAdjoint()))(0.9)
+    forward = jax.jacfwd(lambda e: end(e, diffrax.ForwardMode()))(0.9)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
+    np.testing.assert_allclose(forward, exact, rtol=1e-6)
+
+
+def test_batch_is_one_at_a_time():
+    end = lambda e: bouncing(e, 2.2).ys[0][-1, 1]
+    together = jax.vmap(lambda e: bouncing(e, 2.2, throw=False))(jnp.array([0.2, 0.8, 0.9]))
+    np.testing.assert_allclose(together.ys[0][1:, -1, 1], [end(0.8), end(0.9)], rtol=1e-10, atol=1e-12)
+    assert list(together.result == dae_jax.RESULTS.successful) == [False, True, True]
+    with pytest.raises(RuntimeError, match="more jumps"):
+        end(0.2)
+
+
+def test_a_ball_that_comes_to_rest_is_reported():
+    sol = bouncing(0.5, 10.0, throw=False)
+    assert sol.result == dae_jax.RESULTS.too_many_jumps
+    found = np.asarray(sol.stats["jump_times"])
+    np.testing.assert_allclose(found[np.isfinite(found)][-1], np.sqrt(2 / GRAVITY) * 3, atol=1e-8)
+
+
+def test_pendulum_with_a_stop_at_its_lowest_point():
+    """An elastic stop: it comes back to where it was released, and hits the stop every half period."""
+    scene = pendulum()
+    stop = dae_jax.Jump(lambda t, y, args, **_: y[0][0], lambda t, y, args: ((y[0], -y[1]), args))
+    quarter = ellipk(0.5) / np.sqrt(GRAVITY)
+    sol = dae_jax.daesolve(
+        scene.system, dae_jax.OrthogonalProjection(dae_jax.DOP853()), 0.0, 6 * quarter, None, scene.y0, event=stop,
+        saveat=diffrax.SaveAt(ts=[2 * quarter, 6 * quarter]),
+        stepsize_controller=diffrax.PIDController(rtol=1e-10, atol=1e-10),
+    )  # fmt: skip
+    np.testing.assert_allclose(sol.stats["jump_times"][:3], quarter * np.array([1, 3, 5]), atol=1e-8)
+    np.testing.assert_allclose(sol.ys[0], [[1.0, 0.0], [1.0, 0.0]], atol=1e-7)
+    assert dae_jax.drift(scene.system, sol).position.max() < 1e-13
+
+
+@pytest.mark.parametrize("solver", [dae_jax.RadauIIA5(), dae_jax.BDF()])
+def test_a_diode_switches(solver):
+    """C u̇ = i − u/R; on: i = (E − u)/r, off: i = 0. It switches where i, or u − E, falls through zero."""
+    supply, c, r_load, r_on = (lambda t: jnp.sin(2 * t)), 1.0, 5.0, 0.1
+    f = lambda t, x, z, on: (z - x / r_load) / c
+    g = lambda t, x, z, on: z - on * (supply(t) - x) / r_on
+    switch = dae_jax.Jump(
+        lambda t, y, on, **_: jnp.where(on > 0, y[1][0], y[0][0] - supply(t)),
+        lambda t, y, on: (y, 1 - on),
+        direction=False,
+    )
+    sol = dae_jax.daesolve(
+        dae_jax.SemiExplicitDAE(f, g), solver, 0.0, 9.0, None, (jnp.zeros(1), jnp.zeros(1)), 1.0, event=switch,
+        stepsize_controller=diffrax.PIDController(rtol=1e-9, atol=1e-9), max_steps=20_000,
+    )  # fmt: skip
+    # The field has a kink only, so a tight solve needs no events.
+    field = lambda t, u: (max(np.sin(2 * t) - u[0], 0) / r_on - u[0] / r_load) / c
+    tight = solve_ivp(field, (0, 9), [0.0], "DOP853", rtol=1e-12, atol=1e-13, max_step=0.005, dense_output=True)
+    assert sol.stats["jumps"] == 5
+    assert abs(float(sol.ys[0][-1, 0]) - tight.y[0, -1]) < 1e-7
+    at = np.asarray(sol.stats["jump_times"][:5])
+    np.testing.assert_allclose(tight.sol(at)[0], np.sin(2 * at), atol=1e-7)
+
+
+@pytest.mark.parametrize("finder", [optimistix.Newton(1e-10, 1e-10), optimistix.Bisection(1e-10, 1e-10)])
+@pytest.mark.parametrize("solver", [diffrax.Tsit5(), dae_jax.RadauIIA5(), dae_jax.BDF()])
+def test_an_event_of_diffrax_ends_the_solve(solver, finder):
+    event = diffrax.Event(lambda t, y, args, **_: y[0][1] - 0.25, finder)
+    sol = dae_jax.daesolve(BALL, solver, 0.0, 2.0, None, RELEASED, event=event)
+    assert sol.result == dae_jax.RESULTS.event_occurred
+    np.testing.assert_allclose(sol.ts, [np.sqrt(1.5 / GRAVITY)], atol=1e-7)
+
+
+def test_refusals():
+    with pytest.raises(ValueError, match="no steps or dense output"):
+        bouncing(0.9, 2.0, saveat=diffrax.SaveAt(steps=True))
+    with pytest.raises(ValueError, match="use OrthogonalProjection"):
+        bouncing(0.9, 2.0, solver=dae_jax.TangentSpace(diffrax.Tsit5()))
+    away = dae_jax.Jump(lambda t, y, e, **_: y[0][1], lambda t, y, e: ((y[0] * jnp.nan, y[1]), e))
+    sol = dae_jax.daesolve(BALL, diffrax.Tsit5(), 0.0, 2.0, None, RELEASED, 0.9, event=away, throw=False)
+    assert sol.result == dae_jax.RESULTS.inconsistent_start
