@@ -5,11 +5,11 @@ import os
 import sys
 from pathlib import Path
 
-from . import chain, cost, sweep, timing, work_precision
+from . import chain, cost, stiff, sweep, timing, work_precision
 from .peers import NAMES, PACKAGES, load
 
 
-PARTS = {"work-precision": work_precision, "chain": chain, "cost": cost, "sweep": sweep}
+PARTS = {"work-precision": work_precision, "chain": chain, "cost": cost, "sweep": sweep, "stiff": stiff}
 
 
 def main(argv=None):

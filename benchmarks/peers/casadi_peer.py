@@ -78,3 +78,52 @@ def _equations(n, keep_multipliers):
     pull = [tension[i] * d[:, i] for i in range(n)] + [0]
     equations["ode"] = casadi.vertcat(casadi.vec(v), *(gravity - pull[i] + pull[i + 1] for i in range(n)))
     return equations
+
+
+stiff_methods = ("IDAS",)
+
+
+def stiff(problem, rtol, method):
+    import casadi
+
+    if problem.semi_explicit is None:
+        raise ValueError("not in semi-explicit form of index 1, which CasADi takes")
+    split = len(problem.y0) - len(problem.algebraic)
+    x, z, t = casadi.SX.sym("x", split), casadi.SX.sym("z", len(problem.algebraic)), casadi.SX.sym("t")
+    ode, alg = problem.semi_explicit(t, x, z, casadi)
+    equations = {"x": x, "z": z, "t": t, "ode": casadi.vertcat(*ode), "alg": casadi.vertcat(*alg)}
+    options = _stiff_options(problem, rtol, split)
+    integrator = casadi.integrator("stiff", "idas", equations, 0.0, problem.t1, options)
+    start = {"x0": casadi.DM(problem.y0[:split]), "z0": casadi.DM(problem.y0[split:])}
+
+    def solve():
+        found = integrator(**start)
+        return found["xf"], found["zf"]
+
+    return np.concatenate([np.asarray(part).ravel() for part in solve()]), solve
+
+
+def _stiff_options(problem, rtol, split):
+    """With the derivatives of the start, without which IDAS does not get off it."""
+    start = {"calc_ic": False, "init_xdot": problem.dy0[:split].tolist()}
+    return {"reltol": rtol, "abstol": problem.scale * rtol, "max_num_steps": 1_000_000, **start}
+
+
+def robertson_variations(rates, rtol):
+    """One integrator, called for each row of rates: (end values of y₃, solve)."""
+    import casadi
+
+    from . import stiff_problems
+
+    problem = stiff_problems.robertson()
+    x, z, p = casadi.SX.sym("x", 2), casadi.SX.sym("z", 1), casadi.SX.sym("p", 3)
+    ode, alg = problem.semi_explicit(0.0, x, z, casadi, [p[i] for i in range(3)])
+    equations = {"x": x, "z": z, "p": p, "ode": casadi.vertcat(*ode), "alg": casadi.vertcat(*alg)}
+    options = _stiff_options(problem, rtol, 2)
+    integrator = casadi.integrator("robertson", "idas", equations, 0.0, problem.t1, options)
+    start = {"x0": casadi.DM([1, 0]), "z0": casadi.DM([0])}
+
+    def solve():
+        return np.array([float(integrator(**start, p=rate)["zf"]) for rate in rates])
+
+    return solve(), solve

@@ -81,3 +81,65 @@ def _prepare(scene, start, rtol, t1, method, batch=False):
         return compiled(start).block_until_ready()
 
     return np.asarray(solve()), solve
+
+
+stiff_methods = ("RadauIIA5", "BDF", "OrthogonalProjection(DOP853)")
+
+
+def stiff(problem, rtol, method):
+    import diffrax
+    import jax
+    import jax.numpy as jnp
+
+    import dae_jax
+
+    jax.config.update("jax_enable_x64", True)
+    scene = problem.scene()
+    solver = {
+        "RadauIIA5": dae_jax.RadauIIA5(),
+        "BDF": dae_jax.BDF(),
+        "OrthogonalProjection(DOP853)": dae_jax.OrthogonalProjection(dae_jax.DOP853()),
+    }[method]
+    if scene.stiff and method.startswith("Orthogonal"):
+        raise ValueError("an explicit method on a stiff problem")
+
+    @jax.jit
+    def end(start):
+        sol = dae_jax.daesolve(
+            scene.system, solver, 0.0, scene.t1, None, start, max_steps=1_000_000,
+            stepsize_controller=diffrax.PIDController(rtol=rtol, atol=scene.scale * rtol), throw=False,
+        )  # fmt: skip
+        return jnp.concatenate([x[-1] for x in jax.tree.leaves(sol.ys)])
+
+    start = jax.tree.map(jnp.asarray, scene.y0)
+    solve = lambda: end(start).block_until_ready()
+    found = np.asarray(solve())
+    if not np.isfinite(found).all():
+        raise RuntimeError("the solve failed")
+    return found, solve
+
+
+def robertson_variations(rates, rtol):
+    """`sweep` of one `daesolve` over the rows of rates: (end values of y₃, solve)."""
+    import diffrax
+    import jax
+    import jax.numpy as jnp
+
+    import dae_jax
+
+    jax.config.update("jax_enable_x64", True)
+    f = lambda t, x, z, k: jnp.stack(
+        [k[1] * x[1] * z[0] - k[0] * x[0], k[0] * x[0] - k[1] * x[1] * z[0] - k[2] * x[1] ** 2]
+    )
+    system = dae_jax.SemiExplicitDAE(f, lambda t, x, z, k: jnp.stack([x[0] + x[1] + z[0] - 1]))
+    start = (np.array([1.0, 0.0]), np.array([0.0]))
+
+    def end(k):
+        sol = dae_jax.daesolve(
+            system, dae_jax.RadauIIA5(), 0.0, 1e11, None, start, k, max_steps=100_000, throw=False,
+            stepsize_controller=diffrax.PIDController(rtol=rtol, atol=1e-6 * rtol),
+        )  # fmt: skip
+        return sol.ys[1][-1, 0]
+
+    solve = lambda: np.asarray(dae_jax.sweep(end, jnp.asarray(rates), progress=False))
+    return solve(), solve

@@ -5,7 +5,7 @@ For the chain, unknowns ordered link by link so that the banded solver serves, w
 
 import numpy as np
 
-from . import missing, problems, residuals
+from . import missing, problems, residuals, stiff_problems
 
 
 name = "IDA (scikit-sundae)"
@@ -75,5 +75,34 @@ def _prepare(residual, start, slope, algebraic, rtol, t1, **options):
         if not solution.success:
             raise RuntimeError(f"IDA: {solution.message}")
         return solution.y[-1]
+
+    return solve(), solve
+
+
+stiff_methods = ("BDF",)
+
+
+def stiff(problem, rtol, method):
+    import math
+
+    from sksundae.ida import IDA
+
+    def residual(t, y, dy, out):
+        out[:] = problem.residual(t, y.tolist(), dy.tolist(), math)
+
+    jacobians = stiff_problems.jacobians(problem)
+
+    def jacobian(t, y, dy, out, cj, matrix):
+        by_y, by_slope = jacobians(t, y, dy)
+        matrix[:] = by_y + cj * by_slope
+
+    options = {"algebraic_idx": list(problem.algebraic)} if problem.algebraic else {}
+    integrator = IDA(residual, rtol=rtol, atol=problem.scale * rtol, max_num_steps=20_000, jacfn=jacobian, **options)
+
+    def solve():
+        solution = integrator.solve([0.0, problem.t1], problem.y0, problem.dy0)
+        if not solution.success:
+            raise RuntimeError(f"IDA: {solution.message}")
+        return solution.y[-1][: problem.size]
 
     return solve(), solve
