@@ -22,7 +22,7 @@ class Method:
     keeps: bool = False
     formulation: Any = None
     adaptive: bool = False
-    # Another tableau inside the same code: its derivatives are those of the first.
+    # Another tableau inside the same code: derivatives and batches are those of the first.
     twin: bool = False
 
 

@@ -38,12 +38,12 @@ def test_published_end_values_to_six_digits(name):
 @pytest.mark.parametrize("name", ["hessenberg-2", "capacitor-loop"])
 def test_index_two_follows_the_tolerance(name):
     errors = []
-    for rtol in (1e-5, 1e-7, 1e-9):
+    for rtol in (1e-5, 1e-9):
         scene, sol = of_scene(name, rtol)
         errors.append(scene.error(np.asarray(sol.ts), sol.ys))
         assert errors[-1] < 50 * rtol
         assert sol.stats["num_rejected_steps"] < 0.1 * sol.stats["num_steps"]
-    assert errors[2] < 1e-2 * errors[0]
+    assert errors[1] < 1e-2 * errors[0]
 
 
 def test_work_grows_as_order_five_does():

@@ -37,11 +37,10 @@ SOLVERS = {
     "projection": dae_jax.OrthogonalProjection(dae_jax.DOP853()),
     "tangent": dae_jax.TangentSpace(diffrax.Tsit5()),
 }
-# Each solver with each kind of step, and with each kind of output.
+# Each solver, each kind of step and each kind of output; all pairs of the last two that make sense.
 CASES = [
-    ("Tsit5", "t1", "adaptive"), ("Tsit5", "t0, ts, t1", "fixed"), ("Tsit5", "ts, fn", "adaptive"), ("Tsit5", "t1", "backwards"),
-    ("projection", "t0, ts, t1", "adaptive"), ("projection", "ts, fn", "fixed"), ("projection", "t1", "backwards"),
-    ("tangent", "ts, fn", "adaptive"), ("tangent", "t0, ts, t1", "fixed"), ("tangent", "t1", "backwards"),
+    ("Tsit5", "t1", "backwards"), ("Tsit5", "t0, ts, t1", "fixed"), ("projection", "t0, ts, t1", "adaptive"),
+    ("projection", "ts, fn", "fixed"), ("tangent", "ts, fn", "adaptive"), ("tangent", "t1", "fixed"),
 ]  # fmt: skip
 
 
