@@ -1,10 +1,12 @@
 """Stiff problems of index 1 to 3 with published end values: error against warm run time, and 1,000 variations of one."""
 
+import functools
+
 import numpy as np
 
 from . import timing
 from .peers import stiff_problems
-from .work_precision import time_at
+from .work_precision import curves, time_at, timed
 
 
 RTOLS = tuple(10.0**-k for k in range(4, 11))
@@ -17,10 +19,7 @@ def run(peers, repeats, quick):
     rows = []
     for name, make in stiff_problems.PROBLEMS.items():
         for rtol in QUICK_RTOLS if quick else RTOLS:
-            found = _at(name, make(), peers, rtol, repeats)
-            rows += found
-            for row in found:
-                print(_line(row), flush=True)
+            rows += _at(name, make(), peers, rtol, repeats)
     rates = np.array([0.04, 1e4, 3e7]) * np.exp(np.random.default_rng(0).uniform(-1, 1, (VARIATIONS, 3)))
     for peer in peers:
         if hasattr(peer, "robertson_variations"):
@@ -32,38 +31,12 @@ def run(peers, repeats, quick):
 
 
 def _at(name, problem, peers, rtol, repeats):
-    rows, solves = {}, {}
-    for peer in peers:
-        for method in getattr(peer, "stiff_methods", ()):
-            row = {"problem": name, "peer": peer.name, "method": method, "rtol": rtol, "failure": None}
-            try:
-                (end, solve), first = timing.first_call(peer.stiff, problem, rtol, method)
-            except Exception as error:  # a peer that fails is a row, not the end of the table
-                row["failure"] = f"{type(error).__name__}: {error}".splitlines()[0][:80]
-            else:
-                row |= {"error": stiff_problems.error(name, np.asarray(end)), "first": first}
-                solves[peer.name, method] = solve
-            rows[peer.name, method] = row
-    for key, measured in timing.measure_together(solves, repeats).items():
-        rows[key]["time"] = measured
-    return list(rows.values())
-
-
-def _line(row):
-    head = f"{row['problem']:<12} {row['peer']:<22} {row['method']:<30} {row['rtol']:>6.0e}"
-    if row["failure"]:
-        return f"{head} failed: {row['failure']}"
-    return f"{head} {row['error']:>8.1e} {1e3 * row['time'].median:>10.3f} ms (first {row['first']:.2f} s)"
-
-
-def _curves(rows, problem):
-    found = {}
-    for row in rows:
-        if row["problem"] == problem and not row.get("failure") and row.get("error", 0) > 0:
-            times, errors = found.setdefault((row["peer"], row["method"]), ([], []))
-            times.append(row["time"].median)
-            errors.append(row["error"])
-    return found
+    calls = {
+        (peer.name, method): functools.partial(peer.stiff, problem, rtol, method)
+        for peer in peers
+        for method in getattr(peer, "stiff_methods", ())
+    }
+    return timed(name, rtol, calls, lambda end: stiff_problems.error(name, np.asarray(end)), repeats)
 
 
 def figures(rows):
@@ -71,7 +44,7 @@ def figures(rows):
     from dae_jax import plotting
 
     for problem in stiff_problems.PROBLEMS:
-        points = {f"{peer}, {method}": curve for (peer, method), curve in _curves(rows, problem).items()}
+        points = {f"{peer}, {method}": curve for (peer, method), curve in curves(rows, problem).items()}
         if points:
             yield f"work_precision_{problem}", plotting.work_precision(points, problem)
 
@@ -79,9 +52,9 @@ def figures(rows):
 def targets(rows):
     """(what, measured ratio, limit): this library against each peer at an error of 1e-6."""
     for problem in stiff_problems.PROBLEMS:
-        curves = _curves(rows, problem)
-        best = lambda name, curves=curves: min(
-            (t for (peer, _), c in curves.items() if peer == name and (t := time_at(c, 1e-6))), default=None
+        found = curves(rows, problem)
+        best = lambda name, found=found: min(
+            (t for (peer, _), c in found.items() if peer == name and (t := time_at(c, 1e-6))), default=None
         )
         ours = best("dae_jax")
         ratio = lambda name, ours=ours, best=best: None if not ours or not best(name) else best(name) / ours

@@ -1,5 +1,7 @@
 """Error of the end state against warm run time, on the pendulum and the double pendulum, 10 s."""
 
+import functools
+
 import numpy as np
 
 from . import timing
@@ -20,30 +22,37 @@ def run(peers, repeats, quick):
     for problem, reference in PROBLEMS.items():
         exact = reference()
         for rtol in QUICK_RTOLS if quick else RTOLS:
-            found = list(_at(problem, exact, peers, rtol, repeats))
-            rows += found
-            for row in found:
-                print(_line(row), flush=True)
+            rows += _at(problem, exact, peers, rtol, repeats)
     return rows
 
 
 def _at(problem, exact, peers, rtol, repeats):
+    calls = {
+        (peer.name, method): functools.partial(getattr(peer, problem.replace(" ", "_")), rtol, method=method)
+        for peer in peers
+        for method in peer.methods
+    }
+    return timed(problem, rtol, calls, lambda end: float(np.abs(end - exact).max()), repeats)
+
+
+def timed(problem, rtol, calls, error_of, repeats):
+    """One row for each of {(peer, method): call}; a call gives (end state, solve), as the peers do."""
     rows, solves = {}, {}
-    for peer in peers:
-        for method in peer.methods:
-            key = peer.name, method
-            row = {"problem": problem, "peer": peer.name, "method": method, "rtol": rtol, "failure": None}
-            try:
-                (end, solve), first = timing.first_call(getattr(peer, problem.replace(" ", "_")), rtol, method=method)
-            except Exception as error:  # a peer that fails is a row, not the end of the table
-                row["failure"] = f"{type(error).__name__}: {error}".splitlines()[0][:80]
-            else:
-                row |= {"error": float(np.abs(end - exact).max()), "first": first}
-                solves[key] = solve
-            rows[key] = row
+    for (peer, method), call in calls.items():
+        row = {"problem": problem, "peer": peer, "method": method, "rtol": rtol, "failure": None}
+        try:
+            (end, solve), first = timing.first_call(call)
+        except Exception as error:  # a peer that fails is a row, not the end of the table
+            row["failure"] = f"{type(error).__name__}: {error}".splitlines()[0][:80]
+        else:
+            row |= {"error": error_of(end), "first": first}
+            solves[peer, method] = solve
+        rows[peer, method] = row
     for key, measured in timing.measure_together(solves, repeats).items():
         rows[key]["time"] = measured
-    return rows.values()
+    for row in rows.values():
+        print(_line(row), flush=True)
+    return list(rows.values())
 
 
 def _line(row):

@@ -3,11 +3,13 @@
 import subprocess
 import sys
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import dae_jax
 from dae_jax.kernels import configure, hindrances, one_kernel, scalarise
 
 
@@ -286,3 +288,16 @@ class TestProcessWide:
         command = [sys.executable, "-c", program]
         done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
         assert done.returncode == 0, done.stderr
+
+
+def test_printing_from_a_users_function_prevents_one_kernel(capfd):
+    def force(t, q, v, args):
+        jax.debug.print("t = {t}", t=t)
+        return jnp.array([0.0, 9.81])
+
+    system = dae_jax.ConstrainedSystem(force, lambda t, q, args: (q @ q - 1) / 2)
+    sol = dae_jax.daesolve(system, diffrax.Tsit5(), 0.0, 0.1, 0.05, (jnp.array([1.0, 0.0]), jnp.zeros(2)))
+    jax.block_until_ready(sol.ys)
+    jax.effects_barrier()
+    assert np.isfinite(sol.ys[0]).all()
+    assert "t = " in capfd.readouterr().out

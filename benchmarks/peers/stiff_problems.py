@@ -104,11 +104,9 @@ def amplifier():
         ]
 
     y0 = np.asarray(SCENES["amplifier"]().y0)
-    # The published start's derivatives; those of the two nodes without a current law of their own are any that fit.
-    slope = np.array(
-        [51.338775, 51.338775, -supply / (2 * c2 * r), -24.9757667, -24.9757667, -supply / (2 * c4 * r), 0, 0]
-    )
-    slope[6:] = -10.00564453
+    # As the test set gives them.
+    u1, u3, u5, u6, u8 = 51.338775, -supply / (2 * c2 * r), -24.9757667, -supply / (2 * c4 * r), -10.00564453
+    slope = np.array([u1, u1, u3, u5, u5, u6, u8, u8])
     return Problem(residual, y0, slope, (), 8, 1.0, 0.2, name="amplifier")
 
 
@@ -150,7 +148,7 @@ PROBLEMS = {"robertson": robertson, "akzo-nobel": akzo_nobel, "amplifier": ampli
 
 
 def jacobians(problem):
-    """(t, y, y') → (∂F/∂y, ∂F/∂y'), exact: without it solve_dae fails on two of the problems, and IDA is slower."""
+    """(t, y, y') → (∂F/∂y, ∂F/∂y'), exact: without them solve_dae fails on two of the problems."""
     import casadi
 
     n = len(problem.y0)

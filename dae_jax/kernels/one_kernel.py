@@ -125,25 +125,21 @@ def _evaluate(jaxpr: Jaxpr, consts: Any, args: Any) -> list[Any]:
         return v.val if isinstance(v, jax.extend.core.Literal) else env[v]
 
     for eqn in jaxpr.eqns:
-        values = [read(v) for v in eqn.invars]
-        if not any(map(_is_check, _equations_in(eqn))):
-            results = eqn.primitive.bind(*values, **eqn.primitive.get_bind_params(eqn.params))
-            results = results if eqn.primitive.multiple_results else [results]
-        else:
-            results = _without_its_checks(eqn, values)
-        env.update(zip(eqn.outvars, results, strict=True))
+        env.update(zip(eqn.outvars, _results(eqn, [read(v) for v in eqn.invars]), strict=True))
     return [read(v) for v in jaxpr.outvars]
 
 
-def _without_its_checks(eqn: Any, values: list[Any]) -> list[Any]:
-    """The results of an equation with checks in it."""
-    inner = _unchecked(eqn)
-    if inner is not None:
-        return _evaluate(inner.jaxpr, inner.consts, values[len(values) - len(inner.jaxpr.invars) :])
-    if eqn.primitive.name == "cond":
-        index, *operands = values
-        branches = [lambda *xs, b=b: _evaluate(b.jaxpr, b.consts, xs) for b in eqn.params["branches"]]
-        return jax.lax.switch(index, branches, *operands)
+def _results(eqn: Any, values: list[Any]) -> list[Any]:
+    """What an equation gives, without the checks in it."""
+    name = eqn.primitive.name
+    if name in ("jit", "pjit", "custom_jvp_call", "cond") and any(map(_is_check, _equations_in(eqn))):
+        inner = _unchecked(eqn)
+        if inner is not None:
+            return _evaluate(inner.jaxpr, inner.consts, values[len(values) - len(inner.jaxpr.invars) :])
+        if name == "cond":
+            index, *operands = values
+            branches = [lambda *xs, b=b: _evaluate(b.jaxpr, b.consts, xs) for b in eqn.params["branches"]]
+            return jax.lax.switch(index, branches, *operands)
     results = eqn.primitive.bind(*values, **eqn.primitive.get_bind_params(eqn.params))
     return results if eqn.primitive.multiple_results else [results]
 
