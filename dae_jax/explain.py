@@ -140,7 +140,7 @@ def explain(
     solve, system, t0, _, _, y0, args = inputs
     traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(inputs))
     rank = system.rank if traced else refuse_bad_start(system, t0, y0, args)
-    kernel, arrays, _ = solve.kernel(*inputs[1:], rank)
+    kernel, arrays = solve.kernel(*inputs[1:], rank)
     found = hindrances(jax.make_jaxpr(without_checks(kernel))(arrays))
     enabled = one_kernel_enabled() and jax.default_backend() == "cpu" and solve.derivative() != "any"
     method = f"{_name(solve.formulation)}, {_name(solver)}"

@@ -59,10 +59,19 @@ def split(inputs: Any) -> tuple[Program, list[Any]]:
     return Program(treedef, static, tuple(map(type, static)), one_kernel_enabled()), arrays
 
 
-class _Static(eqx.Module):
-    """What a jitted function returns that is not an array."""
+class _Split(eqx.Module):
+    """What a jitted function returns: its arrays, and the rest."""
 
-    value: Any = eqx.field(static=True)
+    numbers: Any
+    rest: Any = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, tree: Any) -> "_Split":
+        return cls(*eqx.partition(tree, eqx.is_array))
+
+    def whole(self) -> Any:
+        """The two together."""
+        return eqx.combine(self.numbers, self.rest)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -71,14 +80,20 @@ def _jitted(program: Program, rank: int | None, arrays: list[Any]) -> Any:
     sol, as_expected = (
         (solve_with_jumps(solve, *inputs, rank)) if isinstance(solve.event, Jump) else solve(*inputs, rank)
     )
-    numbers, rest = eqx.partition(sol, eqx.is_array)
-    return numbers, _Static(rest), as_expected
+    return _Split.of(sol), as_expected
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _numbers(program: Program, rank: int | None, arrays: list[Any]) -> _Split:
+    """diffrax's part of a solve; jitted, so that derivatives and batches of it find it traced."""
+    solve, *inputs = program.inputs(arrays)
+    return _Split.of(solve._diffeqsolve(*inputs, rank))
 
 
 def run(program: Program, rank: int | None, arrays: list[Any]) -> tuple[DAESolution, Any]:
     """The solution, and whether the start was consistent and of the given rank."""
-    numbers, rest, as_expected = _jitted(program, rank, arrays)
-    return eqx.combine(numbers, rest.value), as_expected
+    sol, as_expected = _jitted(program, rank, arrays)
+    return sol.whole(), as_expected
 
 
 class _Decode(eqx.Module):
@@ -119,7 +134,7 @@ class Solve(eqx.Module):
     def __call__(
         self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, rank: int | None
     ) -> tuple[DAESolution, Any]:
-        numbers, arrays, outline = self.kernel(system, t0, t1, dt0, y0, args, rank)
+        numbers, arrays = self.kernel(system, t0, t1, dt0, y0, args, rank)
         out = one_kernel(numbers, self.derivative(), self._pull_back(system, t0, t1, dt0, y0, args, rank))(arrays)
         if isinstance(system, ConstrainedSystem):
             ode = MechanicalODE.of(system, t0, y0, args, rank)
@@ -127,25 +142,21 @@ class Solve(eqx.Module):
             consistent = violation(ode, t0, start).consistent()
         else:
             consistent = unsolved(system, t0, y0, args).consistent()
-        sol = self._solution(eqx.combine(out, outline[0]), args, rank, consistent)
+        sol = self._solution(out.whole(), args, rank, consistent)
         return sol, consistent if rank is None else consistent & (redundancy(ode, t0, start).rank == rank)
 
     def kernel(
         self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, rank: int | None
-    ) -> tuple[Callable[[Any], Any], Any, list[Any]]:
-        """What can become one kernel: a function of arrays, its arrays, and a list that holds, once the function has been
-        traced, what of its result is not an array.
-        """
-        arrays, static = eqx.partition((self, system, t0, t1, dt0, y0, args), eqx.is_array)
-        outline: list[Any] = []
+    ) -> tuple[Callable[[list[Any]], "_Split"], list[Any]]:
+        """What can become one kernel: a function of arrays, and its arrays."""
+        program, arrays = split((self, system, t0, t1, dt0, y0, args))
 
-        def numbers(arrays: Any) -> Any:
-            solve, *rest = eqx.combine(arrays, static)
-            out, fixed = eqx.partition(solve._diffeqsolve(*rest, rank), eqx.is_array)
-            outline[:] = [fixed]
-            return out
+        def numbers(arrays: list[Any]) -> _Split:
+            # JAX's derivatives name the (empty) mesh, and would trace anew what was traced without a name for it.
+            with jax.sharding.use_abstract_mesh(jax.sharding.get_abstract_mesh()):
+                return _numbers(program, rank, arrays)
 
-        return numbers, arrays, outline
+        return numbers, arrays
 
     def _pull_back(
         self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, rank: int | None
@@ -154,21 +165,23 @@ class Solve(eqx.Module):
         size = sum(leaf.size for leaf in jax.tree.leaves(y0))
         if self.derivative() != "reverse" or not can_be_taped(self, size):
             return None
-        _, static = eqx.partition((self, system, t0, t1, dt0, y0, args), eqx.is_array)
+        program, _ = split((self, system, t0, t1, dt0, y0, args))
 
         def pull_back(inputs: Any, cotangent: Any) -> list[Any]:
-            solve, *rest = eqx.combine(inputs[0], static)
-            _, _, ts, ys, *_ = dataclasses.replace(solve, saveat=recorded(solve.saveat))._diffeqsolve(*rest, rank)
-            numbers, others = eqx.partition(inputs[0], eqx.is_inexact_array)
+            (arrays,) = inputs
+            solve, *rest = program.inputs(arrays)
+            recording, also_arrays = dataclasses.replace(solve, saveat=recorded(solve.saveat)).kernel(*rest, rank)
+            _, _, ts, ys, *_ = recording(also_arrays).numbers
+            numbers, others = eqx.partition(arrays, eqx.is_inexact_array)
             fixed: list[Any] = []
 
             def encoded(numbers: Any) -> Any:
-                solve, *inputs = eqx.combine(numbers, others, static)
+                solve, *inputs = program.inputs(eqx.combine(numbers, others))
                 found, fixed[:] = eqx.partition(solve._taped(*inputs, rank), eqx.is_inexact_array)
                 return found
 
             found, through_encoding = jax.vjp(encoded, numbers)
-            of_t0, of_t1, of_ts, of_ys, *_ = cotangent
+            of_t0, of_t1, of_ts, of_ys, *_ = cotangent.numbers
             fixed_steps = isinstance(self.controller, diffrax.ConstantStepSize)
             of_taped = cotangents(eqx.combine(found, Taped(*fixed)), fixed_steps, (ts["tape"], ys["tape"]), of_ys)
             return inexact(through_encoding(saved_times(of_taped, self.saveat.subs, of_t0, of_t1, of_ts))[0])

@@ -241,64 +241,58 @@ def _forward(fn: Callable[..., Any]) -> Callable[..., Any]:
     return solve
 
 
-def _fused(fn: Callable[..., Any], batched: bool = False) -> Callable[..., Any]:
+def _fused(fn: Callable[..., Any]) -> Callable[..., Any]:
     def traced(*args: Any) -> Any:
-        leaves, treedef = jax.tree.flatten(args)
-        structure: list[Any] = []
-
-        def flat(*flat_leaves: Any) -> list[Any]:
-            out, tree = jax.tree.flatten(fn(*jax.tree.unflatten(treedef, flat_leaves)))
-            structure[:] = [tree]
-            return out
-
-        @custom_vmap
-        def call(*xs: Any) -> list[Any]:
-            return _compile(flat, xs, batched)
-
-        @call.def_vmap
-        def _(axis_size: int, is_batched: list[bool], *xs: Any) -> Any:
-            return _batch(flat, axis_size, is_batched, xs)
-
-        out = call(*leaves)
-        return jax.tree.unflatten(structure[0], out)
+        jaxpr, out = jax.make_jaxpr(without_checks(fn), return_shape=True)(*args)
+        return jax.tree.unflatten(jax.tree.structure(out), _call(jaxpr)(*jax.tree.leaves(args)))
 
     return traced
 
 
-def _batch(flat: Callable[..., list[Any]], size: int, is_batched: list[bool], xs: Any) -> tuple[list[Any], list[bool]]:
+def _call(jaxpr: ClosedJaxpr, batched: bool = False) -> Callable[..., list[Any]]:
+    @custom_vmap
+    def call(*xs: Any) -> list[Any]:
+        return _compile(jaxpr, xs, batched)
+
+    @call.def_vmap
+    def _(axis_size: int, is_batched: list[bool], *xs: Any) -> Any:
+        return _batch(jaxpr, axis_size, is_batched, xs)
+
+    return call
+
+
+def _batch(jaxpr: ClosedJaxpr, size: int, is_batched: list[bool], xs: Any) -> tuple[list[Any], list[bool]]:
     """All lanes in step, where that can be one kernel or where a lane alone cannot; else one after another in one kernel,
     where none waits for another (10,000 double pendulums: 0.6 s in place of 8).
     """
     axes = [0 if b else None for b in is_batched]
-    varies: list[bool] = []
+    kept: list[bool] = []
 
     def lane(*ys: Any) -> list[Any]:
-        out = flat(*ys)
+        out = jaxpr_as_fun(jaxpr)(*ys)
         # `jacfwd` asks that a value which does not depend on the direction stays unbatched.
-        varies[:] = [getattr(o, "batch_dim", None) is not None for o in out]
+        kept[:] = [getattr(o, "batch_dim", None) is not None for o in out]
         return out
 
-    together = jax.vmap(lane, in_axes=axes, axis_size=size)
-    in_step = jax.make_jaxpr(without_checks(together))(*xs)
-    kept = list(varies)
-    one = [jax.ShapeDtypeStruct(x.shape[1:] if b else x.shape, x.dtype) for x, b in zip(xs, is_batched, strict=True)]
+    in_step = jax.make_jaxpr(jax.vmap(lane, in_axes=axes, axis_size=size))(*xs)
 
     def in_turn(*ys: Any) -> list[Any]:
         lanes = tuple(y for y, b in zip(ys, is_batched, strict=True) if b)
 
         def one_lane(lane: Any) -> list[Any]:
             of_lane = iter(lane)
-            return flat(*(next(of_lane) if b else y for y, b in zip(ys, is_batched, strict=True)))
+            return jaxpr_as_fun(jaxpr)(*(next(of_lane) if b else y for y, b in zip(ys, is_batched, strict=True)))
 
         return jax.lax.map(one_lane, lanes)
 
-    together_is_best = _qualifies(in_step, batched=True) or not _qualifies(jax.make_jaxpr(without_checks(flat))(*one))
-    out = _fused(together, batched=True)(*xs) if together_is_best else _fused(in_turn)(*xs)
-    return [o if v else o[0] for o, v in zip(out, kept, strict=True)], kept
+    if _qualifies(in_step, batched=True) or not _qualifies(jaxpr):
+        out = _call(in_step, batched=True)(*xs)
+    else:
+        out = _call(jax.make_jaxpr(in_turn)(*xs))(*xs)
+    return [o if v else o[0] for o, v in zip(out, kept, strict=True)], list(kept)
 
 
-def _compile(fn: Callable[..., Any], args: Any, batched: bool) -> Any:
-    jaxpr = jax.make_jaxpr(without_checks(fn))(*args)
+def _compile(jaxpr: ClosedJaxpr, args: Any, batched: bool) -> list[Any]:
     if not _qualifies(jaxpr, batched):
         return jax.jit(jaxpr_as_fun(jaxpr))(*args)
     # The kernel has nothing but a call in it: XLA aborts where one of its parameters is not the operand of anything.
