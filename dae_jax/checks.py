@@ -85,7 +85,7 @@ def refuse_misfits(system: Any, formulation: Any, solver: Any, t0: Any, y0: Any,
             f"`formulation` must be a formulation such as dae_jax.Baumgarte(...), but is {_brief(formulation)}."
         )
     name = type(solver).__name__
-    if takes_residuals(solver) and not isinstance(formulation, Residual):
+    if takes_residuals(solver) and not isinstance(formulation, Residual | DummyDerivatives):
         raise ValueError(
             f"{name} solves 0 = F(t, y, ẏ) as it is written, and takes no {type(formulation).__name__}: use "
             "`formulation=dae_jax.Residual()`, or no `formulation`."
@@ -95,9 +95,10 @@ def refuse_misfits(system: Any, formulation: Any, solver: Any, t0: Any, y0: Any,
             f"{name} needs an ODE, and Residual is none: solve it with RadauIIA5() or BDF(), or use {name} with "
             "Differentiation()."
         )
-    if isinstance(formulation, DummyDerivatives) and not hasattr(unrolled(solver), "landing_step"):
+    fits = takes_residuals(solver) or hasattr(unrolled(solver), "landing_step")
+    if isinstance(formulation, DummyDerivatives) and not fits:
         raise ValueError(
-            "DummyDerivatives takes an explicit Runge–Kutta solver such as diffrax.Tsit5() or DOP853(), but got "
+            "DummyDerivatives takes an explicit Runge–Kutta solver such as DOP853(), RadauIIA5() or BDF(), but got "
             f"{_brief(solver)}."
         )
     if isinstance(formulation, StateSpace) and not isinstance(system, ConstrainedSystem):
@@ -116,7 +117,7 @@ def refuse_no_event(solver: Any) -> None:
     if isinstance(solver, TangentSpace):
         raise ValueError(
             "Events need a solution between steps in the coordinates of the step, which the local coordinates of TangentSpace "
-            "and DummyDerivatives are not; use OrthogonalProjection, RadauIIA5 or BDF."
+            "and of DummyDerivatives with an explicit solver are not; use OrthogonalProjection, RadauIIA5 or BDF."
         )
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Inexact, Int
 from .constraints import at_one_instant
 from .linalg.dense import LOOPED
 from .linalg.storage import Banded, Dense, Storage
+from .reduced import ReducedForm
 from .residual import ResidualForm
 from .structure import (
     StructurallySingular,
@@ -61,13 +62,15 @@ class Outline:
 
 
 class Pencil(eqx.Module):
-    """J + c M with J = ∂F/∂y and M = ∂F/∂ẏ, of a `ResidualForm`. It travels through `diffrax.diffeqsolve` as `args`."""
+    """J + c M with J = ∂F/∂y and M = ∂F/∂ẏ, of a residual. It travels through `diffrax.diffeqsolve` as `args`."""
 
-    form: ResidualForm
+    form: ResidualForm | ReducedForm
     outline: Outline = eqx.field(static=True)
 
     @classmethod
-    def of(cls, form: ResidualForm, y: Float[Array, " n"], indices: tuple[int, ...] | None = None) -> "Pencil":
+    def of(
+        cls, form: ResidualForm | ReducedForm, y: Float[Array, " n"], indices: tuple[int, ...] | None = None
+    ) -> "Pencil":
         """Finds, while tracing, which equation depends on which variable and derivative.
 
         Errors: `ValueError` for a structurally singular system.

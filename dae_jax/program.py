@@ -24,6 +24,7 @@ from .solvers import (
     DOP853,
     AbstractManifoldSolver,
     OrthogonalProjection,
+    SelectedResiduals,
     SelectedStates,
     TangentSpace,
     first_step,
@@ -230,7 +231,7 @@ class Solve(eqx.Module):
             self.event,
             cond_fn=jax.tree.map(lambda c: _on_states(c, decode, args), self.event.cond_fn, is_leaf=callable),
         )
-        selects = isinstance(solver, SelectedStates)
+        selects = isinstance(solver, SelectedStates | SelectedResiduals)
         saveat = dataclasses.replace(saveat, solver_state=True) if selects else saveat
         sol = diffrax.diffeqsolve(
             self.formulation.term(),

@@ -16,11 +16,11 @@ from .checks import (
     refuse_no_event,
     takes_residuals,
 )
-from .formulations import AbstractFormulation, Differentiation, DummyDerivatives, Residual
+from .formulations import AbstractFormulation, Differentiation, DummyDerivatives, ReducedResidual, Residual
 from .jumps import Jump, refuse_other_outputs
 from .program import Program, Solve, run, split
 from .solution import RESULTS, DAESolution
-from .solvers import SelectedStates
+from .solvers import SelectedResiduals, SelectedStates
 from .systems import System
 
 
@@ -89,7 +89,9 @@ def prepared(
     if formulation is None:
         formulation = Residual() if takes_residuals(solver) else Differentiation()
     refuse_misfits(system, formulation, solver, t0, y0, args)
-    if isinstance(formulation, DummyDerivatives):
+    if isinstance(formulation, DummyDerivatives) and takes_residuals(solver):
+        formulation, solver = ReducedResidual(), SelectedResiduals(solver.rtol, solver.atol, solver=solver)
+    elif isinstance(formulation, DummyDerivatives):
         solver = SelectedStates(solver)
     dtype = jnp.result_type(*jax.tree.leaves(y0))
     if stepsize_controller is None:

@@ -71,6 +71,10 @@ class Orders:
         """The equations whose derivative of order `level` is an invariant."""
         return np.flatnonzero(np.array(self.equations) > level)
 
+    def dummies(self, k: int) -> Int[np.ndarray, " n"]:
+        """Where in Y the derivative of order Dⱼ − k of each variable is, a dummy derivative at level k; −1: nowhere."""
+        return np.array([self.places[d - k][j] if d >= k else -1 for j, d in enumerate(self.variables)])
+
     def names(self, form: ResidualForm) -> tuple[str, ...]:
         """A name for each invariant, in the order of `StructuralODE.invariants`."""
         marks = ("", "d/dt ", *(f"d^{k}/dt^{k} " for k in range(2, 10)))
@@ -121,34 +125,37 @@ class StructuralODE(ManifoldODE):
         """Whether the highest derivatives enter linearly: whether their coefficients do not depend on them."""
         state = jax.ShapeDtypeStruct((self.orders.size,), y.dtype)
         time = jax.ShapeDtypeStruct((), y.dtype)
-        coefficients = lambda t, s, x: jax.jacfwd(lambda x: self._highest(t, s, x))(x)
+        coefficients = lambda t, s, x: jax.jacfwd(lambda x: self.of_highest_order(t, s, x))(x)
         return not dependence(coefficients, time, state, y, derivative=True)[2].any()
 
     # The equations and their derivatives
 
-    def _levels(self, t: Any, y: Float[Array, " N"], x: Float[Array, " n"], count: int) -> list[Float[Array, " n"]]:
+    def levels(self, t: Any, y: Float[Array, " N"], x: Float[Array, " n"], count: int) -> list[Float[Array, " n"]]:
         """F, dF/dt, … at (Y, X): `count` of them, each right in the equations of which only Y and X are needed."""
         both = jnp.concatenate([y, x])
         orders = [take(both, place) for place in self.orders.places]
         return total_derivatives(self.form.residual, jnp.asarray(t, y.dtype), orders, count)
 
-    def _highest(self, t: Any, y: Any, x: Any) -> Float[Array, " n"]:
+    def of_highest_order(self, t: Any, y: Any, x: Any) -> Float[Array, " n"]:
         """Fᵢ^(Cᵢ)."""
-        levels = self._levels(t, y, x, max(self.orders.equations) + 1)
+        return self.highest_of(self.levels(t, y, x, max(self.orders.equations) + 1))
+
+    def highest_of(self, levels: list[Float[Array, " n"]]) -> Float[Array, " n"]:
+        """Fᵢ^(Cᵢ) of all the derivatives of F."""
         return jnp.stack([levels[k][i] for i, k in enumerate(self.orders.equations)])
 
     @at_one_instant
     def _system(self, t: Any, y: Any, feedback: Any) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
         """The matrix and the right-hand side of the equations for X."""
         zero = jnp.zeros(self.form.size, y.dtype)
-        right = -self._highest(t, y, zero)
+        right = -self.of_highest_order(t, y, zero)
         if feedback is not None:
-            levels = self._levels(t, y, zero, max(self.orders.equations, default=0))
+            levels = self.levels(t, y, zero, max(self.orders.equations, default=0))
             terms = [
                 feedback(*(levels[k][i] for k in range(c))) if c else 0 for i, c in enumerate(self.orders.equations)
             ]
             right = right - jnp.stack([jnp.asarray(term, y.dtype) for term in terms])
-        return jax.jacfwd(lambda x: self._highest(t, y, x))(zero), right
+        return jax.jacfwd(lambda x: self.of_highest_order(t, y, x))(zero), right
 
     def highest(self, t: Any, y: Float[Array, " N"], feedback: Any = None) -> Float[Array, " n"]:
         """X, the derivatives of order Dⱼ."""
@@ -165,7 +172,7 @@ class StructuralODE(ManifoldODE):
         highest = max(self.orders.equations)
         if not highest:
             return (jnp.zeros(0, y.dtype),)
-        levels = self._levels(t, y, jnp.zeros(self.form.size, y.dtype), highest)
+        levels = self.levels(t, y, jnp.zeros(self.form.size, y.dtype), highest)
         return tuple(take(level, self.orders.rows(k)) for k, level in enumerate(levels))
 
     def violations(self, t: Any, y: Any) -> Float[Array, " m"]:
@@ -220,8 +227,7 @@ class StructuralODE(ManifoldODE):
         available, quality, present, first, directions = jnp.ones(len(d), y.dtype), infinite, infinite, 0, []
         for k in range(1, max(self.orders.equations) + 1):
             rows = self.orders.rows(k - 1)
-            # Where in Y the derivative of order Dⱼ − k of each variable is.
-            place = np.array([self.orders.places[max(d[j] - k, 0)][j] if d[j] >= k else -1 for j in range(len(d))])
+            place = self.orders.dummies(k)
             level = jnp.stack([matrix[i] for i in rows]) * (d >= k)
             taken, smallest = _pivots(level * available)
             quality, available = jnp.minimum(quality, smallest), jnp.sum(taken, 0)

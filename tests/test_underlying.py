@@ -228,7 +228,7 @@ def test_derivatives_through_a_switch():
     np.testing.assert_allclose(reverse, forward, rtol=1e-8)
 
 
-def test_dummy_derivatives_take_explicit_solvers_only():
+def test_dummy_derivatives_take_no_implicit_solver_of_odes():
     with pytest.raises(ValueError, match="explicit Runge"):
         dae_jax.daesolve(
             PENDULUM.system, dae_jax.Trapezoid(), 0.0, 1.0, 0.1, PENDULUM.y0, formulation=dae_jax.DummyDerivatives()

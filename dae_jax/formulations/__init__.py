@@ -6,6 +6,6 @@ Each has `encode(system, t, state, args) → (y, ode)`, `term()` and `decode(t, 
 
 from .baumgarte import Baumgarte as Baumgarte
 from .differentiation import AbstractFormulation as AbstractFormulation, Differentiation as Differentiation
-from .dummy_derivatives import DummyDerivatives as DummyDerivatives
+from .dummy_derivatives import DummyDerivatives as DummyDerivatives, ReducedResidual as ReducedResidual
 from .residual import GGL as GGL, Residual as Residual
 from .state_space import StateSpace as StateSpace

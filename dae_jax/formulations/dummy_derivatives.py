@@ -2,17 +2,22 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from ..pencil import Pencil
+from ..reduced import ReducedForm
 from ..residual import ResidualForm
 from ..underlying import StructuralODE
 from .differentiation import Differentiation
+from .residual import Residual
 
 
 class DummyDerivatives(Differentiation):
     """The equations and their derivatives that structural analysis asks for, with as many *dummy derivatives*: entries of
-    (y, ẏ, …) that are not integrated but found from the equations, at each stage of an explicit solver.
+    (y, ẏ, …) that are not integrated but found from the equations: at each stage of an explicit solver by Newton's method, by
+    `RadauIIA5` and `BDF`, for stiff systems, as the algebraic variables of a system of index 1.
 
     Which ones is decided level by level, by complete pivoting on the system Jacobian at the start, and again at any step at
     which the choice has become worse than the best by more than a factor (hysteresis), inside one compiled solve: nothing
@@ -28,3 +33,15 @@ class DummyDerivatives(Differentiation):
         form = ResidualForm.of(system, t, state, args)
         ode = StructuralODE.of(form, jnp.result_type(*jax.tree.leaves(state)))
         return ode.encode(t, state), ode
+
+
+class ReducedResidual(Residual):
+    """The equations of `DummyDerivatives` for a solver of residuals: see `ReducedForm`."""
+
+    def encode(self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None) -> tuple[Any, Pencil]:
+        y, ode = DummyDerivatives().encode(system, t, state, args, rank)
+        form = ReducedForm(ode, ode.selection(t, y, None)[0])
+        z = form.encode(t, y)
+        # The selection changes: the structure is that of all of them.
+        pencil = Pencil.of(form.with_all_candidates(y.dtype), z)
+        return z, eqx.tree_at(lambda p: p.form, pencil, form)

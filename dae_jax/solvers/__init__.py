@@ -11,7 +11,7 @@ from .orthogonal_projection import OrthogonalProjection as OrthogonalProjection
 from .radau import RadauIIA5 as RadauIIA5
 from .rattle import RATTLE as RATTLE
 from .residual_steps import AbstractResidualSolver as AbstractResidualSolver, first_step as first_step
-from .selected_states import SelectedStates as SelectedStates
+from .selected_states import SelectedResiduals as SelectedResiduals, SelectedStates as SelectedStates
 from .symmetric_projection import SymmetricProjection as SymmetricProjection
 from .tangent_space import TangentSpace as TangentSpace
 from .trapezoid import Trapezoid as Trapezoid

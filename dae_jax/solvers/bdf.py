@@ -136,6 +136,9 @@ class BDF(AbstractResidualSolver):
         factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda: like.factor(y0)[0]))
         return _start(args, sign, t0, y0, factors)
 
+    def forget(self, state: _State) -> _State:
+        return state._replace(c=jnp.zeros_like(state.c))
+
     def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: _State, made_jump: Any) -> Any:
         # A lane of a batch that has ended goes on with steps of length 0, whose derivatives are multiplied by 0.
         h = jnp.where(t1 == t0, 1, t1 - t0)

@@ -156,6 +156,9 @@ class RadauIIA5(AbstractResidualSolver):
             jnp.zeros((3, y0.size), y0.dtype), zero, rates, jacobians, factors, zero, jnp.asarray(True), zero + 1
         )
 
+    def forget(self, state: _State) -> _State:
+        return state._replace(refresh=jnp.ones_like(state.refresh))
+
     def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: _State, made_jump: Any) -> Any:
         state = solver_state._replace(
             refresh=solver_state.refresh | made_jump, h=jnp.where(made_jump, 0, solver_state.h)

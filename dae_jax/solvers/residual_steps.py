@@ -1,5 +1,6 @@
 """What the solvers of residuals have in common: tolerances, Newton's method, and what becomes of a step that failed."""
 
+import abc
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -29,6 +30,10 @@ class AbstractResidualSolver(diffrax.AbstractAdaptiveSolver):
 
     def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
         return terms.vf(t0, y0, args)
+
+    @abc.abstractmethod
+    def forget(self, state: Any) -> Any:
+        """The solver's state without its iteration matrix, for equations that are others now for the same unknowns."""
 
 
 class Tolerances(NamedTuple):

@@ -1,19 +1,23 @@
 """Steps in coordinates that are chosen among the entries of the state, and chosen again when they turn bad."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 
 from .manifold import clock
+from .residual_steps import AbstractResidualSolver, constant
 from .tangent_space import TangentSpace
 
 
 class Selection(NamedTuple):
-    """What a step leaves to the next: ẏ at its end, the directions of the entries that are not integrated, and how often
-    these have changed.
+    """What a step leaves to the next: the inner solver's state (ẏ at the step's end for an explicit one), the directions of
+    the entries that are not integrated, and how often these have changed.
     """
 
-    derivative: Any
+    inner: Any
     directions: Any
     switches: Any
 
@@ -30,6 +34,42 @@ class SelectedStates(TangentSpace):
     def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Selection, made_jump: Any) -> Any:
         directions, switched = args.selection(clock(terms, t0, t1) * t0, y0, solver_state.directions)
         y1, error, dense, derivative, result = self.step_in(
-            directions, terms, t0, t1, y0, args, solver_state.derivative, made_jump
+            directions, terms, t0, t1, y0, args, solver_state.inner, made_jump
         )
         return y1, error, dense, Selection(derivative, directions, solver_state.switches + switched), result
+
+
+class SelectedResiduals(AbstractResidualSolver):
+    """A step of a solver of residuals on a `ReducedForm`, in which the entries that are not integrated are algebraic
+    variables. The unknowns are the same whatever is selected, so that a multistep method keeps its history. Used by
+    `DummyDerivatives`, which see.
+    """
+
+    solver: AbstractResidualSolver = dataclasses.field(kw_only=True)
+
+    @property
+    def interpolation_cls(self) -> Any:
+        return self.solver.interpolation_cls
+
+    def order(self, terms: Any) -> Any:
+        return self.solver.order(terms)
+
+    def error_order(self, terms: Any) -> Any:
+        return self.solver.error_order(terms)
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Selection:
+        return Selection(self.solver.init(terms, t0, t1, y0, args), constant(args.form.directions), jnp.asarray(0))
+
+    def forget(self, state: Selection) -> Selection:
+        return state._replace(inner=self.solver.forget(state.inner))
+
+    def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Selection, made_jump: Any) -> Any:
+        ode = args.form.ode
+        directions, switched = ode.selection(
+            clock(terms, t0, t1) * t0, y0[: ode.orders.size], solver_state.directions
+        )
+        solver = dataclasses.replace(self.solver, rtol=self.rtol, atol=self.atol)
+        pencil = eqx.tree_at(lambda p: p.form.directions, args, directions)
+        state = jax.tree.map(lambda a, b: jnp.where(switched, a, b), self.forget(solver_state), solver_state)
+        *step, inner, result = solver.step(terms, t0, t1, y0, pencil, state.inner, made_jump)
+        return *step, Selection(inner, directions, solver_state.switches + switched), result

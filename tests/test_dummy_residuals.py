@@ -1,0 +1,84 @@
+"""Dummy derivatives as the algebraic variables of a system of index 1, for RadauIIA5 and BDF."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dae_jax
+from dae_jax.scenes import SCENES
+
+
+PENDULUM = SCENES["pendulum"]()
+DUMMY = dae_jax.DummyDerivatives()
+
+
+def solved(system, solver, t1, y0, tolerance, **options):
+    controller = diffrax.PIDController(rtol=tolerance, atol=tolerance)
+    return dae_jax.daesolve(
+        system, solver, 0.0, t1, None, y0, formulation=DUMMY, stepsize_controller=controller, max_steps=20_000, **options
+    )
+
+
+def test_through_many_switches():
+    times = np.linspace(0, 5, 51)
+    sol = solved(PENDULUM.system, dae_jax.BDF(), 5.0, PENDULUM.y0, 1e-9, saveat=diffrax.SaveAt(ts=times))
+    assert int(sol.stats["switches"]) > 6
+    assert PENDULUM.error(times, sol.ys) < 1e-6
+    drift = dae_jax.drift(PENDULUM.system, sol)
+    assert max(drift.position.max(), drift.velocity.max()) < 1e-8
+
+
+def test_order_five():
+    def error(step):
+        sol = dae_jax.daesolve(PENDULUM.system, dae_jax.RadauIIA5(), 0.0, 0.8, step, PENDULUM.y0, formulation=DUMMY)
+        assert int(sol.stats["switches"]) >= 1
+        return PENDULUM.error(np.array([0.8]), sol.ys)
+
+    assert np.log2(error(0.04) / error(0.02)) > 4.6
+
+
+def test_index_five_which_is_beyond_methods_for_the_equations_as_written():
+    scene = SCENES["integrators-5"]()
+    with pytest.raises(ValueError, match="index up to 3"):
+        dae_jax.daesolve(scene.system, dae_jax.BDF(), 0.0, scene.t1, None, scene.y0)
+    sol = solved(scene.system, dae_jax.BDF(), scene.t1, scene.y0, 1e-9)
+    assert scene.error(np.array([scene.t1]), sol.ys) < 1e-8
+
+
+RATE = 1e6
+
+
+def stiff(t, y, yd, args):
+    """The pendulum (x, y, u, v, λ) and a sensor that follows x at a rate of 10⁶/s."""
+    position, velocity, multiplier, sensor = y[:2], y[2:4], y[4], y[5]
+    force = jnp.array([0.0, 9.81]) - multiplier * position
+    length = (jnp.sum(position**2, keepdims=True) - 1) / 2
+    follows = yd[5] + RATE * (sensor - position[0])
+    return jnp.concatenate([yd[:2] - velocity, yd[2:4] - force, length, follows[None]])
+
+
+def test_a_stiff_system_of_index_three():
+    """An explicit method would need a million steps."""
+    sol = solved(dae_jax.ImplicitDAE(stiff), dae_jax.RadauIIA5(), 2.0, np.array([1.0, 0, 0, 0, 0, 1.0]), 1e-8)
+    q, v = PENDULUM.reference(np.array([2.0]))
+    assert int(sol.stats["num_steps"]) < 3000
+    np.testing.assert_allclose(sol.ys[-1, :4], np.concatenate([q[0], v[0]]), atol=2e-5)
+    # Behind by ẋ/rate.
+    np.testing.assert_allclose(sol.ys[-1, 5], sol.ys[-1, 0] - sol.ys[-1, 2] / RATE, atol=1e-9)
+
+
+def test_derivatives_through_a_switch():
+    def end(angle, adjoint):
+        y0 = (jnp.stack([jnp.sin(angle), jnp.cos(angle)]), jnp.zeros(2))
+        sol = solved(PENDULUM.system, dae_jax.BDF(), 0.8, y0, 1e-9, adjoint=adjoint)
+        return sol.ys[0][-1, 0], sol.stats["switches"]
+
+    h = 1e-3
+    values, switches = jax.vmap(lambda a: end(a, diffrax.ForwardMode()))(jnp.array([1.2 - h, 1.2 + h]))
+    assert (switches >= 1).all()
+    forward = jax.jacfwd(lambda a: end(a, diffrax.ForwardMode())[0])(1.2)
+    np.testing.assert_allclose(forward, (values[1] - values[0]) / (2 * h), rtol=1e-4)
+    reverse = jax.grad(lambda a: end(a, diffrax.RecursiveCheckpointAdjoint())[0])(1.2)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-8)
