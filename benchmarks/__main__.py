@@ -49,7 +49,7 @@ def main(argv=None):
 def verdict(text, measured, limit):
     """One line: what, measured, reached or not."""
     if measured is None:
-        return f"{text:<56} not measured: nothing to compare with"
+        return f"{text:<56} not measured: one of the two is missing or does not get there"
     reached = measured >= limit if "≥" in text else measured <= limit
     return f"{text:<56} {measured:10.3g}   {'reached' if reached else 'MISSED'}"
 

@@ -121,9 +121,10 @@ def targets(rows):
         ours = best("dae_jax", error, "OrthogonalProjection")
         yield f"time of the C program at {error:g} ≤ 1.5", _ratio(ours, best("C DOP853", error, "projected")), 1.5
         yield f"time of heyoka at {error:g} ≤ 1.5", _ratio(best("dae_jax", error), best("heyoka", error)), 1.5
-        plain = found.get(("dae_jax", "DOP853"))
-        projected = time_at(found["dae_jax", "OrthogonalProjection(DOP853)"], error)
-        unprojected = None if plain is None else time_at(plain, error)
+        projected, unprojected = (
+            time_at(found[key], error) if (key := ("dae_jax", method)) in found else None
+            for method in ("OrthogonalProjection(DOP853)", "DOP853")
+        )
         yield f"projected against unprojected at {error:g} ≤ 1.0", _ratio(projected, unprojected), 1.0
 
 

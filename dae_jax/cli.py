@@ -73,8 +73,11 @@ def _compare(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> 
 def _add_analyse(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser("analyse", help="print index, offsets, degrees of freedom and hidden constraints")
     parser.add_argument(
-        "scene", metavar="SCENE | MODULE:NAME", help="a ready scene, or a name in a module that is a Scene or makes one"
+        "system",
+        metavar="SCENE | MODULE:NAME",
+        help="a ready scene, or a name in a module: a Scene, (system, y0) or (system, y0, args), or a function that makes one",
     )
+    parser.add_argument("--out", type=Path, help="file for a drawing of the incidence matrix, such as incidence.png")
     parser.set_defaults(run=_analyse)
 
 
@@ -82,7 +85,7 @@ def _analyse(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> 
     from .analyse import analyse
     from .scenes import SCENES, Scene
 
-    module, colon, name = arguments.scene.partition(":")
+    module, colon, name = arguments.system.partition(":")
     if not colon and module not in SCENES:
         parser.error(f"unknown scene {module!r}; choose from {', '.join(SCENES)}, or give MODULE:NAME")
     try:
@@ -90,14 +93,22 @@ def _analyse(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> 
             sys.path.insert(0, "")
         found = getattr(importlib.import_module(module), name) if colon else SCENES[module]
     except (ImportError, AttributeError) as failure:
-        parser.error(f"{arguments.scene!r} cannot be imported: {failure}")
-    scene = found() if callable(found) else found
-    if not isinstance(scene, Scene):
-        parser.error(f"{arguments.scene!r} is no dae_jax.scenes.Scene, but a {type(scene).__name__}")
+        parser.error(f"{arguments.system!r} cannot be imported: {failure}")
+    found = found() if callable(found) else found
+    if isinstance(found, Scene):
+        found = found.system, found.y0, found.args
+    if not isinstance(found, tuple) or len(found) not in (2, 3):
+        parser.error(f"{arguments.system!r} is no Scene, (system, y0) or (system, y0, args), but a {type(found).__name__}")
+    system, y0, *args = found
     try:
-        print(analyse(scene.system, 0.0, scene.y0, scene.args))
-    except ValueError as refusal:
+        structure = analyse(system, 0.0, y0, *args)
+    except (TypeError, ValueError) as refusal:
         parser.error(str(refusal))
+    print(structure)
+    if arguments.out is not None:
+        from .plotting import incidence
+
+        incidence(structure, arguments.system).savefig(arguments.out)
     return 0
 
 

@@ -17,6 +17,8 @@ MARKERS = "osD^vPX<>*hp"
 GREY = "#999999"
 # What is below is round-off of round-off; a log axis needs a floor.
 FLOOR = 1e-17
+# Equations and variables of a larger system are drawn without their names.
+NAMED = 40
 
 
 def _figure(width: float = 7.2, height: float = 4.4) -> tuple[Any, Any]:
@@ -148,6 +150,41 @@ def scaling(curves: Curves, size: str, quantity: str, title: str = "") -> Any:
         axes.loglog(x, y, label=label, **_look(i))
     axes.set(xlabel=size, ylabel=quantity, title=title)
     _legend_beside(figure)
+    return figure
+
+
+def incidence(structure: Any, title: str = "Incidence") -> Any:
+    """Which variable occurs in which equation of an `analyse`d system: light where it occurs itself, dark where its
+    derivative does; framed are the pairs of the transversal, and the labels give the offsets c and d.
+    """
+    from matplotlib.colors import ListedColormap
+    from matplotlib.patches import Rectangle
+
+    n = len(structure.equations)
+    size = min(max(0.26 * n + 2.4, 4.4), 12)
+    figure, axes = _figure(size, size)
+    axes.grid(visible=False)
+    occurs = np.zeros((n, n))
+    for i, row in enumerate(structure.signature):
+        for j, order in row.items():
+            occurs[i, j] = 1 + min(order, 1)
+    colours = ["white", COLOURS[5], COLOURS[0]]
+    axes.imshow(occurs, cmap=ListedColormap(colours), vmin=0, vmax=2)
+    lines = np.arange(n + 1) - 0.5
+    axes.hlines(lines, -0.5, n - 0.5, color="white", linewidth=1)
+    axes.vlines(lines, -0.5, n - 0.5, color="white", linewidth=1)
+    frame = {"fill": False, "edgecolor": COLOURS[1], "linewidth": 1.6, "zorder": 3}
+    for i, j in enumerate(structure.transversal):
+        axes.add_patch(Rectangle((j - 0.5, i - 0.5), 1, 1, **frame))
+    shown = [Rectangle((0, 0), 1, 1, color=colour) for colour in colours[1:]] + [Rectangle((0, 0), 1, 1, **frame)]
+    labels = ("the variable", "its derivative", "paired")
+    figure.legend(shown, labels, loc="outside lower center", ncols=3, frameon=False, fontsize="small")
+    if n <= NAMED:
+        named = zip(structure.variables, structure.variable_offsets, strict=True)
+        axes.set_xticks(range(n), [f"{name}  d={d}" for name, d in named], rotation=90, fontsize="small")
+        named = zip(structure.equations, structure.equation_offsets, strict=True)
+        axes.set_yticks(range(n), [f"{name}  c={c}" for name, c in named], fontsize="small")
+    axes.set(xlabel="variables", ylabel="equations", title=f"{title}: index {structure.index}")
     return figure
 
 

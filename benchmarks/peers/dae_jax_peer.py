@@ -1,4 +1,6 @@
-"""This library: one jitted `daesolve`, from constraints as plain JAX functions; the sweep is `jit(vmap(daesolve))`."""
+"""This library: one jitted `daesolve`, from constraints as plain JAX functions; the sweep is `dae_jax.sweep`, on one core
+`jit(vmap(daesolve))`.
+"""
 
 import numpy as np
 
@@ -37,10 +39,10 @@ def chain(n, rtol, t1=1.0, method="DOP853"):
     return _prepare(chain(n), problems.chain_start(n), rtol, t1, method)
 
 
-def sweep(angles, rtol, t1=10.0, method="OrthogonalProjection(DOP853)"):
+def sweep(angles, rtol, t1=10.0, method="OrthogonalProjection(DOP853)", threads=1):
     from dae_jax.scenes import double_pendulum
 
-    return _prepare(double_pendulum(), problems.double_pendulum_starts(angles), rtol, t1, method, batch=True)
+    return _prepare(double_pendulum(), problems.double_pendulum_starts(angles), rtol, t1, method, threads)
 
 
 def solution(scene, rtol, t1, method):
@@ -67,17 +69,22 @@ def solution(scene, rtol, t1, method):
     return solve
 
 
-def _prepare(scene, start, rtol, t1, method, batch=False):
+def _prepare(scene, start, rtol, t1, method, threads=None):
+    """`threads`: of a batch of starts; `None` for a single one."""
     import jax
     import jax.numpy as jnp
+
+    import dae_jax
 
     jax.config.update("jax_enable_x64", True)
     solve_from = solution(scene, rtol, t1, method)
     end = lambda start: jnp.concatenate([x[-1] for x in solve_from(start).ys])
-    compiled = jax.jit(jax.vmap(end) if batch else end)
+    compiled = jax.jit(jax.vmap(end) if threads else end)
     start = jnp.asarray(start)
 
     def solve():
+        if threads and threads > 1:
+            return dae_jax.sweep(end, start, progress=False)
         return compiled(start).block_until_ready()
 
     return np.asarray(solve()), solve
