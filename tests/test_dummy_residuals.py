@@ -17,7 +17,7 @@ DUMMY = dae_jax.DummyDerivatives()
 def solved(system, solver, t1, y0, tolerance, **options):
     controller = diffrax.PIDController(rtol=tolerance, atol=tolerance)
     return dae_jax.daesolve(
-        system, solver, 0.0, t1, None, y0, formulation=DUMMY, stepsize_controller=controller, max_steps=20_000, **options
+        system, solver, 0.0, t1, None, y0, formulation=DUMMY, stepsize_controller=controller, max_steps=5000, **options
     )
 
 
@@ -76,9 +76,10 @@ def test_derivatives_through_a_switch():
         return sol.ys[0][-1, 0], sol.stats["switches"]
 
     h = 1e-3
-    values, switches = jax.vmap(lambda a: end(a, diffrax.ForwardMode()))(jnp.array([1.2 - h, 1.2 + h]))
-    assert (switches >= 1).all()
-    forward = jax.jacfwd(lambda a: end(a, diffrax.ForwardMode())[0])(1.2)
-    np.testing.assert_allclose(forward, (values[1] - values[0]) / (2 * h), rtol=1e-4)
+    (low, switches), (high, _) = (end(1.2 + x, diffrax.RecursiveCheckpointAdjoint()) for x in (-h, h))
+    assert switches >= 1
+    along = lambda a: jax.jvp(lambda a: end(a, diffrax.ForwardMode())[0], (a,), (1.0,))[1]
+    forward = jax.jit(along)(1.2)
+    np.testing.assert_allclose(forward, (high - low) / (2 * h), rtol=1e-4)
     reverse = jax.grad(lambda a: end(a, diffrax.RecursiveCheckpointAdjoint())[0])(1.2)
     np.testing.assert_allclose(reverse, forward, rtol=1e-8)

@@ -37,11 +37,8 @@ SOLVERS = {
     "projection": dae_jax.OrthogonalProjection(dae_jax.DOP853()),
     "tangent": dae_jax.TangentSpace(diffrax.Tsit5()),
 }
-# Each solver, each kind of step and each kind of output, in pairs.
-CASES = [
-    ("Tsit5", "t1", "backwards"), ("Tsit5", "t0, ts, t1", "fixed"), ("projection", "t0, ts, t1", "adaptive"),
-    ("projection", "ts, fn", "fixed"), ("tangent", "ts, fn", "adaptive"), ("tangent", "t1", "fixed"),
-]  # fmt: skip
+# Each solver, each kind of step and each kind of output.
+CASES = [("Tsit5", "t1", "backwards"), ("projection", "t0, ts, t1", "adaptive"), ("tangent", "ts, fn", "fixed")]
 
 
 @pytest.mark.parametrize(("solver", "saveat", "steps"), CASES)

@@ -264,7 +264,8 @@ def _call(jaxpr: ClosedJaxpr, batched: bool = False) -> Callable[..., list[Any]]
 
 def _batch(jaxpr: ClosedJaxpr, size: int, is_batched: list[bool], xs: Any) -> tuple[list[Any], list[bool]]:
     """All lanes in step, where that can be one kernel or where a lane alone cannot; else one after another in one kernel,
-    where none waits for another (10,000 double pendulums: 0.6 s in place of 8).
+    where none waits for another (10,000 double pendulums: 0.6 s in place of 8). A single lane, such as the one direction
+    of a derivative by a number, is no batch.
     """
     axes = [0 if b else None for b in is_batched]
     kept: list[bool] = []
@@ -276,6 +277,9 @@ def _batch(jaxpr: ClosedJaxpr, size: int, is_batched: list[bool], xs: Any) -> tu
         return out
 
     in_step = jax.make_jaxpr(jax.vmap(lane, in_axes=axes, axis_size=size))(*xs)
+    if size == 1:
+        out = _call(jaxpr)(*(x[0] if b else x for x, b in zip(xs, is_batched, strict=True)))
+        return [o[None] if v else o for o, v in zip(out, kept, strict=True)], list(kept)
 
     def in_turn(*ys: Any) -> list[Any]:
         lanes = tuple(y for y, b in zip(ys, is_batched, strict=True) if b)
