@@ -116,14 +116,14 @@ def stiff(problem, rtol, method):
             scene.system, solver, 0.0, scene.t1, None, start, max_steps=1_000_000,
             stepsize_controller=diffrax.PIDController(rtol=rtol, atol=scene.scale * rtol), throw=False,
         )  # fmt: skip
-        return jnp.concatenate([x[-1] for x in jax.tree.leaves(sol.ys)])
+        return jnp.concatenate([x[-1] for x in jax.tree.leaves(sol.ys)]), sol.result
 
     start = jax.tree.map(jnp.asarray, scene.y0)
-    solve = lambda: end(start).block_until_ready()
-    found = np.asarray(solve())
-    if not np.isfinite(found).all():
+    solve = lambda: jax.block_until_ready(end(start))
+    found, result = solve()
+    if result != dae_jax.RESULTS.successful:
         raise RuntimeError("the solve failed")
-    return found, solve
+    return np.asarray(found), solve
 
 
 def robertson_variations(rates, rtol):
