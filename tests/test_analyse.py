@@ -124,4 +124,4 @@ def test_command(capsys):
     for wrong in ("pendulums", "dae_jax.scenes:nothing", "math:pi"):
         with pytest.raises(SystemExit):
             main(["analyse", wrong])
-    assert "math:pi' is no dae_jax.scenes.Scene" in capsys.readouterr().err
+    assert "math:pi' is no Scene, (system, y0) or (system, y0, args)" in capsys.readouterr().err

@@ -64,18 +64,12 @@ def test_tune_prints_what_it_found_and_verifies_it(tmp_path, capsys):
 
 def test_analyse_prints_and_draws_a_system_of_a_module(tmp_path, monkeypatch, capsys):
     (tmp_path / "mine.py").write_text(
-        "import dae_jax, numpy as np\n"
-        "integrator = dae_jax.ImplicitDAE(lambda t, y, yd, a: yd - y), np.ones(1)\n"
-        "wrong = 3\n"
+        "import dae_jax, numpy as np\nintegrator = dae_jax.ImplicitDAE(lambda t, y, yd, a: yd - y), np.ones(1)\n"
     )
     monkeypatch.chdir(tmp_path)
     assert main(["analyse", "mine:integrator", "--out", "incidence.png"]) == 0
     assert "1 equations, index 0, 1 degrees of freedom" in capsys.readouterr().out
     assert (tmp_path / "incidence.png").stat().st_size > 10_000
-    for name, message in (("wrong", "but a int"), ("missing", "cannot be imported")):
-        with pytest.raises(SystemExit):
-            main(["analyse", f"mine:{name}"])
-        assert message in capsys.readouterr().err
 
 
 def test_a_method_that_does_not_apply_says_why(tmp_path, capsys):
