@@ -143,15 +143,15 @@ class Pencil(eqx.Module):
         return scale * self.storage.solve(inner, b)
 
     def rates(self, t: Any, y: Float[Array, " n"]) -> Float[Array, " n"]:
-        """ẏ with F(t, y, ẏ) = 0 where y is consistent, else with the least F; 0 for variables whose derivative does not
-        occur. Gauss–Newton's method from 0.
+        """ẏ with F(t, y, ẏ) = 0 where y is consistent, else with the least F; for variables whose derivative does not occur
+        what the form knows. Gauss–Newton's method.
         """
 
         def improve(_: Any, yd: Any) -> Any:
             _, m = self.jacobians(t, y, yd)
             return yd - self.storage.least_squares(m, self.residual(t, y, yd))
 
-        return jax.lax.fori_loop(0, GAUSS_NEWTON, improve, jnp.zeros_like(y))
+        return jax.lax.fori_loop(0, GAUSS_NEWTON, improve, self.form.known_rates(y))
 
     @property
     def controlled(self) -> np.ndarray:

@@ -47,6 +47,10 @@ class ReducedForm(eqx.Module):
         form = self.ode.form
         return form.decode(t, take(z, self.ode.orders.places[0][: form.layout.size]))
 
+    def known_rates(self, z: Float[Array, " z"]) -> Float[Array, " z"]:
+        """What z itself says of ż: the rate of all of Y."""
+        return jnp.concatenate([take(z, self.ode.orders.derivatives), jnp.zeros(self.ode.form.size, z.dtype)])
+
     def with_all_candidates(self, dtype: Any) -> "ReducedForm":
         """With every entry that may become a dummy derivative marked by a half, for structural analysis: whatever is
         selected, its equations depend on no more.
@@ -71,7 +75,7 @@ class ReducedForm(eqx.Module):
         highest = max(orders.equations)
         levels = self.ode.levels(t, y, x, highest + 1)
         last = self.ode.highest_of(levels)
-        rates = zd[: orders.size] - take(z, orders.derivatives)
+        rates = (zd - self.known_rates(z))[: orders.size]
         if not highest:
             return jnp.concatenate([rates, last])
         invariants = jnp.concatenate([take(levels[k], orders.rows(k)) for k in range(highest)])

@@ -88,6 +88,10 @@ class ResidualForm(eqx.Module):
         """The state in the user's structure."""
         return self.layout.unflatten(y[: self.layout.size])
 
+    def known_rates(self, y: Float[Array, " n"]) -> Float[Array, " n"]:
+        """What y itself says of ẏ: nothing, 0."""
+        return jnp.zeros_like(y)
+
     @at_one_instant
     def residual(self, t: Any, y: Float[Array, " n"], yd: Float[Array, " n"]) -> Float[Array, " n"]:
         """F(t, y, ẏ)."""

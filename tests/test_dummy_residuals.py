@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.special import ellipk, ellipkinc
 
 import dae_jax
 from dae_jax.scenes import SCENES
@@ -45,6 +46,19 @@ def test_index_five_which_is_beyond_methods_for_the_equations_as_written():
         dae_jax.daesolve(scene.system, dae_jax.BDF(), 0.0, scene.t1, None, scene.y0)
     sol = solved(scene.system, dae_jax.BDF(), scene.t1, scene.y0, 1e-9)
     assert scene.error(np.array([scene.t1]), sol.ys) < 1e-8
+
+
+@pytest.mark.parametrize("solver", [dae_jax.BDF(), dae_jax.RadauIIA5()])
+def test_a_jump_off_a_surface_that_a_dummy_derivative_leaves(solver):
+    """Released where x is level, thrown back where y = 0.9: there y is found from the constraint."""
+    height, m = 0.9, 0.5
+    amplitude = np.arcsin(np.sin(np.arccos(height) / 2) / np.sqrt(m))
+    fall = (ellipk(m) - ellipkinc(amplitude, m)) / np.sqrt(9.81)
+    bounce = dae_jax.Jump(lambda t, y, args, **_: y[0][1] - height, lambda t, y, args: ((y[0], -y[1]), args))
+    y0 = (np.array([1.0, 0.0]), np.zeros(2))
+    sol = solved(PENDULUM.system, solver, 6 * fall, y0, 1e-8, event=bounce)
+    assert sol.stats["jumps"] == 3
+    np.testing.assert_allclose(sol.stats["jump_times"][:3], fall * np.array([1, 3, 5]), atol=1e-6)
 
 
 RATE = 1e6
