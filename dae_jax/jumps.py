@@ -14,10 +14,10 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from .checks import saved_parts
-from .formulations import Residual
 from .initialise import consistent_state
 from .solution import RESULTS, DAESolution
 from .systems import System
+from .underlying import underlying_ode
 
 
 class Jump(eqx.Module):
@@ -96,7 +96,7 @@ def solve_with_jumps(
     going = int(RESULTS.event_occurred._value)
 
     def part(p: _Progress) -> tuple[DAESolution, Any]:
-        level = _level_at_start(solve, system, jump.condition, p.t, p.y, p.args, rank)
+        level = _level_at_start(system, jump.condition, p.t, p.y, p.args, rank)
         # A downcrossing, as bisection has to know which way it goes.
         up = {True: -1, False: 1, None: jnp.sign(level)}[jump.direction]
         event = diffrax.Event(
@@ -153,13 +153,13 @@ def _after(system: System, jump: Jump, t: Any, y: Any, args: Any) -> tuple[Any, 
 
 
 def _level_at_start(
-    solve: Any, system: System, condition: Callable[..., Any], t: Any, y: Any, args: Any, rank: int | None
+    system: System, condition: Callable[..., Any], t: Any, y: Any, args: Any, rank: int | None
 ) -> Any:
     """The condition at the start of a part; where this is zero, the sign with which it leaves zero."""
-    z, ode = solve.formulation.encode(system, t, y, args, rank)
-    as_written = isinstance(solve.formulation, Residual)
-    rates = ode.rates(t, z) if as_written else solve.formulation.field(t, z, ode)
-    of = lambda t, z: jnp.asarray(condition(t, solve.formulation.decode(t, z, ode), args), t.dtype)
-    value, rate = jax.jvp(of, (t, z), (jnp.ones_like(t), rates))
+    z, ode = underlying_ode(system, t, y, args, rank)
+    of = lambda t, z: jnp.asarray(condition(t, ode.decode(t, z), args), t.dtype)
+    value, rate = jax.jvp(of, (t, z), (jnp.ones_like(t), ode.field(t, z)))
     zero = float(jnp.finfo(t.dtype).eps) ** 0.5 * (1 + jnp.abs(rate))
-    return lax.stop_gradient(jnp.where(jnp.abs(value) > zero, value, jnp.where(rate >= 0, zero, -zero)))
+    # A rate that is not finite, of a system whose Jacobian is singular, tells nothing.
+    leaves = jnp.abs(value) <= jnp.where(jnp.isfinite(zero), zero, -1)
+    return lax.stop_gradient(jnp.where(leaves, jnp.where(rate >= 0, zero, -zero), value))

@@ -93,6 +93,16 @@ def test_pendulum_with_a_stop_at_its_lowest_point():
 
 
 @pytest.mark.parametrize("solver", [dae_jax.RadauIIA5(), dae_jax.BDF()])
+def test_a_crossing_of_an_algebraic_variable_is_one_jump(solver):
+    """Nothing happens at it, so that the next part starts at zero, which z leaves upwards or downwards."""
+    system = dae_jax.SemiExplicitDAE(lambda t, x, z, args: jnp.stack([x[1], -x[0]]), lambda t, x, z, args: z - x[0])
+    count = dae_jax.Jump(lambda t, y, args, **_: y[1], lambda t, y, args: (y, args), most=5)
+    sol = dae_jax.daesolve(system, solver, 0.0, 9.0, None, (jnp.array([1.0, 0.0]), jnp.array(1.0)), event=count)
+    assert sol.stats["jumps"] == 3
+    np.testing.assert_allclose(sol.stats["jump_times"][:3], np.pi * np.array([0.5, 1.5, 2.5]), atol=1e-6)
+
+
+@pytest.mark.parametrize("solver", [dae_jax.RadauIIA5(), dae_jax.BDF()])
 def test_a_diode_switches(solver):
     """C u̇ = i − u/R; on: i = (E − u)/r, off: i = 0. It switches where i, or u − E, falls through zero."""
     supply, c, r_load, r_on = (lambda t: jnp.sin(2 * t)), 1.0, 5.0, 0.1
