@@ -98,7 +98,9 @@ def _analyse(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> 
     if isinstance(found, Scene):
         found = found.system, found.y0, found.args
     if not isinstance(found, tuple) or len(found) not in (2, 3):
-        parser.error(f"{arguments.system!r} is no Scene, (system, y0) or (system, y0, args), but a {type(found).__name__}")
+        parser.error(
+            f"{arguments.system!r} is no Scene, (system, y0) or (system, y0, args), but a {type(found).__name__}"
+        )
     system, y0, *args = found
     try:
         structure = analyse(system, 0.0, y0, *args)

@@ -259,7 +259,7 @@ class MechanicalODE(ManifoldODE):
     def _restored(self, t: Any, y: Any, normals: Any, first: Any) -> tuple[Any, Bool[Array, ""]]:
         def iterate(params: Any) -> tuple[Float[Array, " c"], Bool[Array, ""]]:
             *point, first = params
-            return fixed_point(lambda mu: MechanicalODE.correction(*point, mu), first)
+            return fixed_point(lambda mu: MechanicalODE.correction(*point, mu), *first)
 
         params = (self, t, y, normals, tuple(jax.lax.stop_gradient(first)))
         linear_solve = solve if self.rank is None else _minimum_norm

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .constraints import MechanicalODE
-from .linalg import fixed_point, implicit_root, relative_change
-from .normals import mass_solve
+from .linalg import fixed_point, implicit_root, relative_change, smallest_pivot
+from .normals import SparseNormals, mass_solve
 from .pencil import Pencil
 from .residual import ResidualForm
 from .systems import ConstrainedSystem, System
@@ -114,17 +114,39 @@ class Redundancy(eqx.Module):
 def redundancy(ode: MechanicalODE, t: Any, y: Any) -> Redundancy:
     """Whether constraints depend on each other at the flat state y = (q, v)."""
     q, v = y
-    a = ode.constraint_jacobian(t, q, v)
-    mass = ode.mass(q)
-    lengths = jnp.sqrt(jnp.sum(a * a, 1))
-    scale = 1 / jnp.where(lengths > 0, lengths, 1)
-    schur = jnp.dot(a, mass_solve(mass, a.T))
-    eigenvalues, vectors = jnp.linalg.eigh(schur * scale[:, None] * scale[None, :])
+    a, scale, schur = _scaled_gram(ode, t, y)
+    eigenvalues, vectors = jnp.linalg.eigh(schur)
     independent = eigenvalues > jnp.finfo(q.dtype).eps ** 0.5 * jnp.max(eigenvalues)
-    target = (jnp.dot(a, mass_solve(mass, ode.force(t, q, v))) + ode.bias(t, q, v)) * scale
+    target = (jnp.dot(a, mass_solve(ode.mass(q), ode.force(t, q, v))) + ode.bias(t, q, v)) * scale
     dependent = jnp.where(independent, 0, jnp.dot(vectors.T, target))
     contradiction = jnp.max(jnp.abs(dependent)) / (1 + jnp.max(jnp.abs(target)))
     return Redundancy(jnp.sum(independent), contradiction)
+
+
+def _scaled_gram(ode: MechanicalODE, t: Any, y: Any) -> tuple[Array, Array, Array]:
+    """A, the inverse lengths of its rows, and A M⁻¹Aᵀ for rows of length 1."""
+    q, v = y
+    a = ode.constraint_jacobian(t, q, v)
+    lengths = jnp.sqrt(jnp.sum(a * a, 1))
+    scale = 1 / jnp.where(lengths > 0, lengths, 1)
+    return a, scale, jnp.dot(a, mass_solve(ode.mass(q), a.T)) * scale[:, None] * scale[None, :]
+
+
+def start_is_as_expected(
+    system: System, t: Any, state: Any, args: Any, rank: int | None
+) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+    """Whether a state is consistent, and whether moreover the constraints have the given rank (`None`: all independent)."""
+    if not isinstance(system, ConstrainedSystem):
+        consistent = unsolved(system, t, state, args).consistent()
+        return consistent, consistent
+    ode = MechanicalODE.of(system, t, state, args, rank)
+    y = ode.encode(state)
+    consistent = violation(ode, t, y).consistent()
+    if isinstance(ode.linear, SparseNormals):
+        return consistent, consistent
+    if rank is not None:
+        return consistent, consistent & (redundancy(ode, t, y).rank == rank)
+    return consistent, consistent & (smallest_pivot(_scaled_gram(ode, t, y)[2]) > jnp.finfo(y[0].dtype).eps ** 0.5)
 
 
 def consistent_state(system: System, t0: Any, y0: Any, args: Any = None, *, fixed: Any = None) -> Any:
@@ -186,7 +208,7 @@ def _nearest(ode: MechanicalODE, t: Any, y: Any, weights: Any) -> Any:
             new = _improved(x, params)
             return new, relative_change(new - x, x)
 
-        return fixed_point(correct, correct(jnp.concatenate(params[2])), 100)
+        return fixed_point(correct, jnp.concatenate(params[2]), max_steps=100)
 
     x, _ = implicit_root(lambda x, p: x - _improved(x, p), iterate, params)
     q, v = jnp.split(x, 2)

@@ -152,9 +152,7 @@ def _after(system: System, jump: Jump, t: Any, y: Any, args: Any) -> tuple[Any, 
     return y, jax.tree.map(lambda x, like: jnp.asarray(x, jnp.result_type(like)), new, args)
 
 
-def _level_at_start(
-    system: System, condition: Callable[..., Any], t: Any, y: Any, args: Any, rank: int | None
-) -> Any:
+def _level_at_start(system: System, condition: Callable[..., Any], t: Any, y: Any, args: Any, rank: int | None) -> Any:
     """The condition at the start of a part; where this is zero, the sign with which it leaves zero."""
     z, ode = underlying_ode(system, t, y, args, rank)
     of = lambda t, z: jnp.asarray(condition(t, ode.decode(t, z), args), t.dtype)

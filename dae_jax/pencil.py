@@ -62,10 +62,14 @@ class Outline:
 
 
 class Pencil(eqx.Module):
-    """J + c M with J = ∂F/∂y and M = ∂F/∂ẏ, of a residual. It travels through `diffrax.diffeqsolve` as `args`."""
+    """J + c M with J = ∂F/∂y and M = ∂F/∂ẏ, of a residual. It travels through `diffrax.diffeqsolve` as `args`.
+
+    `start`: ẏ where a solve starts.
+    """
 
     form: ResidualForm | ReducedForm
     outline: Outline = eqx.field(static=True)
+    start: Float[Array, " n"] | None = None
 
     @classmethod
     def of(
@@ -110,18 +114,23 @@ class Pencil(eqx.Module):
     def jacobians(self, t: Any, y: Float[Array, " n"], yd: Float[Array, " n"]) -> tuple[Array, Array]:
         """J and M."""
         t = jnp.asarray(t, y.dtype)
-        if self.outline.by_y is None or self.outline.by_rate is None:
-            return self._all_entries(t, y, yd)
-        along_y = lambda seed: jax.jvp(lambda y: self.residual(t, y, yd), (y,), (seed,))[1]
-        along_rate = lambda seed: jax.jvp(lambda yd: self.residual(t, y, yd), (yd,), (seed,))[1]
-        found = []
-        for along, compression in ((along_y, self.outline.by_y), (along_rate, self.outline.by_rate)):
-            found.append(compression.entries(jax.vmap(along)(jnp.asarray(compression.seeds, y.dtype))))
-        return found[0], found[1]
+        return self._by_y(t, y, yd), self._by_rate(t, y, yd)
 
     @at_one_instant
-    def _all_entries(self, t: Any, y: Float[Array, " n"], yd: Float[Array, " n"]) -> tuple[Array, Array]:
-        return jax.jacfwd(self.form.residual, 1)(t, y, yd), jax.jacfwd(self.form.residual, 2)(t, y, yd)
+    def _by_y(self, t: Any, y: Float[Array, " n"], yd: Float[Array, " n"]) -> Array:
+        return self._by(1, self.outline.by_y, t, y, yd)
+
+    @at_one_instant
+    def _by_rate(self, t: Any, y: Float[Array, " n"], yd: Float[Array, " n"]) -> Array:
+        return self._by(2, self.outline.by_rate, t, y, yd)
+
+    def _by(self, argument: int, compression: Compression | None, *point: Any) -> Array:
+        """The stored entries of the derivative of F(t, y, ẏ) by one of its arguments."""
+        if compression is None:
+            return jax.jacfwd(self.form.residual, argument)(*point)
+        of = lambda x: self.residual(*point[:argument], x, *point[argument + 1 :])
+        along = lambda seed: jax.jvp(of, (point[argument],), (seed,))[1]
+        return compression.entries(jax.vmap(along)(jnp.asarray(compression.seeds, point[1].dtype)))
 
     def factor(self, j: Array, m: Array, c: Any, h: Any) -> tuple[Any, Float[Array, ""]]:
         """The factors of J + c M, for c of the order of 1/h, and the smallest pivot, of round-off size for a singular one.
@@ -146,12 +155,16 @@ class Pencil(eqx.Module):
         """ẏ with F(t, y, ẏ) = 0 where y is consistent, else with the least F; for variables whose derivative does not occur
         what the form knows. Gauss–Newton's method.
         """
+        t = jnp.asarray(t, y.dtype)
 
         def improve(_: Any, yd: Any) -> Any:
-            _, m = self.jacobians(t, y, yd)
-            return yd - self.storage.least_squares(m, self.residual(t, y, yd))
+            return yd - self.storage.least_squares(self._by_rate(t, y, yd), self.residual(t, y, yd))
 
         return jax.lax.fori_loop(0, GAUSS_NEWTON, improve, self.form.known_rates(y))
+
+    def starting(self, t: Any, y: Float[Array, " n"]) -> "Pencil":
+        """For a solve from (t, y)."""
+        return dataclasses.replace(self, start=jax.lax.stop_gradient(self.rates(t, y)))
 
     @property
     def controlled(self) -> np.ndarray:

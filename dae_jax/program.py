@@ -13,9 +13,8 @@ import numpy as np
 import optimistix
 
 from .checks import is_saved_part, saved_parts
-from .constraints import MechanicalODE
 from .formulations import AbstractFormulation, Residual
-from .initialise import redundancy, unsolved, violation
+from .initialise import start_is_as_expected
 from .jumps import Jump, solve_with_jumps
 from .kernels import PullBack, inexact, one_kernel, one_kernel_enabled
 from .linalg import rms_norm
@@ -31,7 +30,6 @@ from .solvers import (
     unrolled,
 )
 from .solvers.tangent_space import TangentPoint
-from .systems import ConstrainedSystem
 from .tape import Taped, as_it_is, can_be_taped, cotangents, recorded, saved_times
 
 
@@ -137,14 +135,17 @@ class Solve(eqx.Module):
     ) -> tuple[DAESolution, Any]:
         numbers, arrays = self.kernel(system, t0, t1, dt0, y0, args, rank)
         out = one_kernel(numbers, self.derivative(), self._pull_back(system, t0, t1, dt0, y0, args, rank))(arrays)
-        if isinstance(system, ConstrainedSystem):
-            ode = MechanicalODE.of(system, t0, y0, args, rank)
-            start = ode.encode(y0)
-            consistent = violation(ode, t0, start).consistent()
-        else:
-            consistent = unsolved(system, t0, y0, args).consistent()
-        sol = self._solution(out.whole(), args, rank, consistent)
-        return sol, consistent if rank is None else consistent & (redundancy(ode, t0, start).rank == rank)
+        check, check_arrays = self._check(system, t0, y0, args, rank)
+        # A yes or no has no derivative.
+        consistent, as_expected = one_kernel(check, self.derivative())(jax.lax.stop_gradient(check_arrays))
+        return self._solution(out.whole(), args, rank, consistent), as_expected
+
+    def _check(
+        self, system: Any, t0: Any, y0: Any, args: Any, rank: int | None
+    ) -> tuple[Callable[..., Any], list[Any]]:
+        """Whether the start is consistent and of the given rank, as a function of arrays, and its arrays."""
+        program, arrays = split((system, t0, y0, args))
+        return lambda arrays: start_is_as_expected(*program.inputs(arrays), rank), arrays
 
     def kernel(
         self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, rank: int | None
@@ -216,7 +217,8 @@ class Solve(eqx.Module):
         solver, controller = _economical(self.solver, self.between()), _fitted(self.controller, t0, t1)
         if isinstance(self.formulation, Residual):
             solver, controller = _of_residuals(solver, controller)
-            dt0 = first_step(ode, solver, t0, t1, y) if dt0 is None else dt0
+            ode = ode.starting(t0, y)
+            dt0 = first_step(ode.start, solver, t0, t1, y) if dt0 is None else dt0
 
         def saved(part: Any) -> Any:
             return part if part.fn is as_it_is else eqx.tree_at(lambda s: s.fn, part, _View(part.fn, decode, args))

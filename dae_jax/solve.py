@@ -107,13 +107,12 @@ def prepared(
 
 
 def _run_on_numbers(program: Program, arrays: list[Any], inputs: Any) -> DAESolution:
-    """`run`, refusing an inconsistent start in words. How many constraints are independent is remembered."""
+    """`run`, refusing an inconsistent start in words. How many constraints are independent is found, and remembered, where it
+    is not all of them.
+    """
     solve, system, t0, t1, _, y0, args = inputs
     refuse_bad_times(solve.saveat, t0, t1)
-    if program not in _ranks:
-        with jax.ensure_compile_time_eval():
-            _ranks[program] = refuse_bad_start(system, t0, y0, args)
-    sol, as_expected = run(program, _ranks[program], arrays)
+    sol, as_expected = run(program, _ranks.get(program, getattr(system, "rank", None)), arrays)
     # Inside an outer `jit` the result is no number, although the inputs are: they are looked at each time it is traced.
     if isinstance(as_expected, jax.core.Tracer) or not as_expected:
         with jax.ensure_compile_time_eval():

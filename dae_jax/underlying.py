@@ -206,7 +206,7 @@ class StructuralODE(ManifoldODE):
                 delta = solve(matrix, ode.violations(t, here))
                 return mu - delta, relative_change(ode.shift(0, normals, delta), here)
 
-            return fixed_point(correct, correct(jnp.zeros(len(normals), y.dtype)))
+            return fixed_point(correct, jnp.zeros(len(normals), y.dtype))
 
         residual = lambda mu, params: params[0].violations(params[1], params[0].shift(params[2], params[3], mu))
         mu, found = implicit_root(residual, iterate, (self, t, y, normals))
@@ -286,7 +286,7 @@ def _nearest(ode: StructuralODE, t: Any, known: Any, weights: Any) -> Any:
             new = moved(y, towards(y), params)
             return new, relative_change(new - y, y)
 
-        return fixed_point(correct, correct(y), STARTING)
+        return fixed_point(correct, y, max_steps=STARTING)
 
     # Derivatives have nothing to be near to but what the equations make of them; the rest of a pull keeps those that the
     # equations leave open from being undetermined.

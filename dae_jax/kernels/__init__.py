@@ -1,9 +1,9 @@
 """How small functions become fast machine code: scalar arithmetic and single kernels."""
 
+from .jaxprs import equations as equations, is_large as is_large
 from .one_kernel import (
     PullBack as PullBack,
     configure as configure,
-    equations as equations,
     hindrances as hindrances,
     inexact as inexact,
     one_kernel as one_kernel,

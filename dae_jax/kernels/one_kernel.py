@@ -9,7 +9,7 @@ import contextlib
 import contextvars
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, Literal
 
 import jax
@@ -19,6 +19,7 @@ from jax.custom_batching import custom_vmap
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
 
+from .jaxprs import equations, equations_in
 from .subroutine import subroutine
 
 
@@ -91,23 +92,6 @@ def _hinders(eqn: Any) -> bool:
     return name in _REFUSED
 
 
-def equations(jaxpr: ClosedJaxpr | Jaxpr) -> Iterator[Any]:
-    """The equations of a jaxpr, at any depth."""
-    for eqn in (jaxpr.jaxpr if isinstance(jaxpr, ClosedJaxpr) else jaxpr).eqns:
-        yield eqn
-        yield from _equations_in(eqn)
-
-
-def _equations_in(eqn: Any) -> Iterator[Any]:
-    for param in jax.tree.leaves(tuple(eqn.params.values()), is_leaf=_is_jaxpr):
-        if _is_jaxpr(param):
-            yield from equations(param)
-
-
-def _is_jaxpr(x: Any) -> bool:
-    return isinstance(x, ClosedJaxpr | Jaxpr)
-
-
 def without_checks(fn: Callable[..., Any]) -> Callable[..., Any]:
     """`fn` without `equinox.error_if`: for conditions that the caller has looked at already."""
 
@@ -133,7 +117,7 @@ def _evaluate(jaxpr: Jaxpr, consts: Any, args: Any) -> list[Any]:
 def _results(eqn: Any, values: list[Any]) -> list[Any]:
     """What an equation gives, without the checks in it."""
     name = eqn.primitive.name
-    if name in ("jit", "pjit", "custom_jvp_call", "cond") and any(map(_is_check, _equations_in(eqn))):
+    if name in ("jit", "pjit", "custom_jvp_call", "cond") and any(map(_is_check, equations_in(eqn))):
         inner = _unchecked(eqn)
         if inner is not None:
             return _evaluate(inner.jaxpr, inner.consts, values[len(values) - len(inner.jaxpr.invars) :])

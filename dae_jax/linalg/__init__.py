@@ -11,4 +11,4 @@ from .newton import (
     roundoff as roundoff,
 )
 from .norm import rms_norm as rms_norm
-from .semidefinite import semidefinite_solve as semidefinite_solve
+from .semidefinite import semidefinite_solve as semidefinite_solve, smallest_pivot as smallest_pivot

@@ -55,7 +55,7 @@ def newton(
             delta = linear_solve(jax.jacfwd(residual)(x, params), residual(x, params))
             return x - delta, relative_change(delta, x)
 
-        return fixed_point(correct, correct(start), max_steps)
+        return fixed_point(correct, start, max_steps=max_steps)
 
     # The start is handed over, not closed over: the derivative rule may run when the trace it is of has ended.
     return implicit_root(from_start, iterate, (params, lax.stop_gradient(x0)), linear_solve=linear_solve)
@@ -63,16 +63,17 @@ def newton(
 
 def fixed_point(
     correct: Callable[[Any], tuple[Any, Float[Array, ""]]],
-    first: tuple[Any, Float[Array, ""]],
+    x: Any,
+    last: Float[Array, ""] | None = None,
     max_steps: int = MAX_STEPS,
 ) -> tuple[Any, Bool[Array, ""]]:
     """Applies `correct`: x ↦ (x, relative size of the correction) until what remains is round-off; see `newton`.
 
-    `first` is what the first correction gave.
+    `last`: the size of the correction that led to `x`, where one has been made.
     """
-    x, last = first
-    tolerance = roundoff(last.dtype)
-    one = jnp.ones((), last.dtype)
+    dtype = jnp.result_type(*jax.tree.leaves(x))
+    tolerance = roundoff(dtype)
+    one = jnp.ones((), dtype)
 
     def unfinished(carry: Any) -> Bool[Array, ""]:
         _, last, previous, count = carry
@@ -84,10 +85,11 @@ def fixed_point(
     def body(carry: Any) -> Any:
         x, last, _, count = carry
         x, size = correct(x)
-        return x, size, jnp.maximum(last, jnp.finfo(last.dtype).tiny), count + 1
+        # The correction before the first counts as 1, so that a first correction δ is expected to leave δ² behind.
+        return x, size, jnp.where(last < jnp.inf, jnp.maximum(last, jnp.finfo(dtype).tiny), one), count + 1
 
-    # The correction before the first counts as 1, so that a first correction δ is expected to leave δ² behind.
-    x, last, previous, _ = lax.while_loop(unfinished, body, (x, last, one, 1))
+    start = (x, jnp.full((), jnp.inf, dtype), one, 0) if last is None else (x, last, one, 1)
+    x, last, previous, _ = lax.while_loop(unfinished, body, start)
     remaining = last * jnp.minimum(last / previous, 1)
     return x, (remaining <= tolerance) | (last < 1000 * tolerance)
 

@@ -36,6 +36,20 @@ def semidefinite_solve(
     return _unrolled(s, b)
 
 
+def smallest_pivot(s: Float[Array, "m m"]) -> Float[Array, ""]:
+    """The smallest pivot of symmetric S = L D Lᵀ, of round-off size where S is singular; not less than its smallest
+    eigenvalue.
+    """
+
+    def eliminate(j, carry):
+        s, smallest = carry
+        pivot = s[j, j]
+        row = s[j] / jnp.where(pivot > 0, pivot, 1)
+        return s - s[:, j][:, None] * row, jnp.minimum(smallest, pivot)
+
+    return jax.lax.fori_loop(0, s.shape[0], eliminate, (s, jnp.asarray(jnp.inf, s.dtype)))[1]
+
+
 def definite_pivot(pivot: Float[Array, "*k"], diagonal: Float[Array, "*k"], m: int) -> Float[Array, "*k"]:
     """The pivot of an m×m matrix, or NaN where it is round-off of the diagonal entry that it was."""
     return jnp.where(pivot > 8 * m * float(jnp.finfo(pivot.dtype).eps) * diagonal, pivot, jnp.nan)

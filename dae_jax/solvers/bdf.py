@@ -134,7 +134,7 @@ class BDF(AbstractResidualSolver):
         sign = clock(terms, t0, t1)
         like = _Step(args, sign, t1, t1 - t0, 1 / (t1 - t0), y0, y0)
         factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda: like.factor(y0)[0]))
-        return _start(args, sign, t0, y0, factors)
+        return _start(sign * args.start, factors)
 
     def forget(self, state: _State) -> _State:
         return state._replace(c=jnp.zeros_like(state.c))
@@ -144,7 +144,9 @@ class BDF(AbstractResidualSolver):
         h = jnp.where(t1 == t0, 1, t1 - t0)
         sign, state = clock(terms, t0, t1), solver_state
         if made_jump is not False:
-            state = lax.cond(made_jump, lambda: _start(args, sign, t0, y0, state.factors), lambda: state)
+            state = lax.cond(
+                made_jump, lambda: _start(sign * constant(args.rates(sign * t0, y0)), state.factors), lambda: state
+            )
         tol = tolerances(self.rtol, self.atol, y0.dtype)
         k, method = state.order, _formula(state, h)
         star = [y0] + [b * row for b, row in zip(method.beta[1:], state.phi, strict=True)]
@@ -181,13 +183,12 @@ class BDF(AbstractResidualSolver):
         return y1, error, {"phi": jnp.where(used, phi, 0), "psi": method.psi}, new, result
 
 
-def _start(pencil: Any, sign: Any, t0: Any, y0: Any, factors: Any) -> _State:
+def _start(rates: Float[Array, " n"], factors: Any) -> _State:
     """No history: φ₁ is dy/dτ, to be multiplied by the size of the first step. It predicts only."""
-    zero, count = jnp.zeros((), y0.dtype), jnp.zeros((), int)
-    rates = sign * constant(pencil.rates(sign * t0, y0))
-    phi = jnp.stack([rates] + [jnp.zeros_like(y0)] * (MAX_ORDER - 1))
+    zero, count = jnp.zeros((), rates.dtype), jnp.zeros((), int)
+    phi = jnp.stack([rates] + [jnp.zeros_like(rates)] * (MAX_ORDER - 1))
     return _State(
-        phi, jnp.ones(len(ROWS), y0.dtype), count, count + 1, count, count, count == 0, factors, zero, zero + 1
+        phi, jnp.ones(len(ROWS), rates.dtype), count, count + 1, count, count, count == 0, factors, zero, zero + 1
     )
 
 

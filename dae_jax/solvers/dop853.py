@@ -70,7 +70,7 @@ class DOP853(diffrax.AbstractAdaptiveSolver):
     ) -> Any:
         """`step`, with its end moved to `land(t1, y1)` → (y1, found)."""
         h = terms.contr(t0, t1)
-        flat = Flat(terms, y0, args, land)
+        flat = Flat(terms, t0, y0, args, land)
         increment = lambda t, y: h * flat.field(t, y)
         k0 = h * first_derivative(flat, t0, state, made_jump)
         ks = increments(_ROWS[: STAGES - 1], coefficients.C[1:STAGES], increment, t0, t1, flat.y0, k0, flat.looped)

@@ -9,11 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from ..kernels import scalarise, subroutine
+from ..kernels import is_large, scalarise, subroutine
 
 
-# A larger state goes through the stages in a loop, so that its field, a large program too, is compiled once and not once
-# a stage: seconds in place of a minute, for some tenths more run time.
+# A larger state goes through the stages in a loop, as one with a large field does: seconds in place of a minute to compile.
 UNROLLED = 8
 
 
@@ -68,11 +67,11 @@ def _increments_in_a_loop(a: Any, c: Any, vector: Any, t0: Any, t1: Any, y0: Any
 class Flat:
     """The field, the state and `land` of a step on one vector, in which every linear combination is one loop."""
 
-    def __init__(self, terms: Any, y0: Any, args: Any, land: Callable[..., Any]) -> None:
+    def __init__(self, terms: Any, t0: Any, y0: Any, args: Any, land: Callable[..., Any]) -> None:
         self.y0, self.tree = ravel_pytree(y0)
         self.field = subroutine(scalarise(lambda t, y: self.vector(terms.vf(t, self.tree(y), args))))
         self._land = land
-        self.looped = self.y0.size > UNROLLED or getattr(terms, "looped", False)
+        self.looped = self.y0.size > UNROLLED or getattr(terms, "looped", False) or is_large(self.field, t0, self.y0)
 
     @staticmethod
     def vector(tree: Any) -> Any:
@@ -129,7 +128,7 @@ class Unrolled(diffrax.AbstractWrappedSolver):
         """`step`, with its end moved to `land(t1, y1)` → (y1, found)."""
         tableau = self.solver.tableau
         h = terms.contr(t0, t1)
-        flat = Flat(terms, y0, args, land)
+        flat = Flat(terms, t0, y0, args, land)
         increment = lambda t, y: h * flat.field(t, y)
         k0 = h * first_derivative(flat, t0, state, made_jump)
         rows, nodes = tableau.a_lower, tableau.c

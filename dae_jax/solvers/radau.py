@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from ..kernels import is_large
 from ..linalg import implicit_root
 from .manifold import clock
 from .radau_coefficients import ALPHA, BACK, BETA, ERROR, GAMMA, INVERSE, NODES, POLYNOMIAL, TRANSFORM
@@ -93,7 +94,10 @@ class _Step(NamedTuple):
 
     def residuals(self, z: Float[Array, "3 n"]) -> list[Float[Array, " n"]]:
         """F at the stages."""
-        return [self.pencil.residual(*stage) for stage in self.stages(z)]
+        stages = self.stages(z)
+        if not is_large(self.pencil.residual, *stages[0]):
+            return [self.pencil.residual(*stage) for stage in stages]
+        return list(lax.map(lambda stage: self.pencil.residual(*stage), jax.tree.map(lambda *x: jnp.stack(x), *stages)))
 
     def jacobians(self, t: Any, y: Any, yd: Any) -> tuple[Any, Any]:
         """∂F/∂y and ∂F/∂(dy/dτ) for the loop's own time τ = ± t."""
@@ -151,9 +155,8 @@ class RadauIIA5(AbstractResidualSolver):
         step = _Step(args, sign, t0, t1, y0)
         unused = jax.eval_shape(lambda: (j := step.jacobians(t0, y0, y0), step.factor(j)[0]))
         jacobians, factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), unused)
-        rates = constant(args.rates(sign * t0, y0))
         return _State(
-            jnp.zeros((3, y0.size), y0.dtype), zero, rates, jacobians, factors, zero, jnp.asarray(True), zero + 1
+            jnp.zeros((3, y0.size), y0.dtype), zero, args.start, jacobians, factors, zero, jnp.asarray(True), zero + 1
         )
 
     def forget(self, state: _State) -> _State:
@@ -229,10 +232,17 @@ def _solve(step: _Step, state: _State, tol: Tolerances) -> Any:
 def _error(step: _Step, factor: Any, z: Any, tol: Tolerances) -> Float[Array, " n"]:
     """−(γ/h M + J)⁻¹ F(t₀, y₀, −Σ eᵢ zᵢ/h), once more from y₀ + error where that is large (eqs. IV.8.19, IV.8.20)."""
     rate = sum(float(e) * z[i] for i, e in enumerate(ERROR)) * (-step.sign / step.h)
-    estimate = lambda y: -step.pencil.solve(factor, step.pencil.residual(step.sign * step.t0, y, rate))
-    error = estimate(step.y0)
-    size = tol.norm(error * step.pencil.weights(step.h), step.y0, step.y0 + z[2])
-    return lax.cond(size < 1, lambda: error, lambda: estimate(step.y0 + error))
+
+    def again(carry: Any) -> Any:
+        count, _, size = carry
+        return (count == 0) | (count == 1) & ~(size < 1)
+
+    def estimate(carry: Any) -> Any:
+        count, error, _ = carry
+        error = -step.pencil.solve(factor, step.pencil.residual(step.sign * step.t0, step.y0 + error, rate))
+        return count + 1, error, tol.norm(error * step.pencil.weights(step.h), step.y0, step.y0 + z[2])
+
+    return lax.while_loop(again, estimate, (0, jnp.zeros_like(step.y0), jnp.zeros_like(step.h)))[1]
 
 
 def _coupled(step: _Step, z: Float[Array, "3 n"]) -> Any:

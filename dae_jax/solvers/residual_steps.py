@@ -19,8 +19,10 @@ NOISE = 0.33
 
 
 class AbstractResidualSolver(diffrax.AbstractAdaptiveSolver):
-    """A solver of 0 = F(t, y, ẏ); needs a `Pencil` as `args`. `rtol`, `atol`: the tolerances that Newton's method is fitted
-    to; by default those of the step-size controller, and round-off for fixed steps.
+    """A solver of 0 = F(t, y, ẏ); needs a `Pencil` as `args`, one that is `starting`.
+
+    `rtol`, `atol`: the tolerances that Newton's method is fitted to; by default those of the step-size controller, and
+    round-off for fixed steps.
     """
 
     rtol: Any = None
@@ -163,13 +165,13 @@ def constant(tree: Any) -> Any:
     return jax.tree.map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
 
 
-def first_step(pencil: Any, solver: Any, t0: Any, t1: Any, y0: Float[Array, " n"]) -> Any:
-    """The size of the first step: no variable moves by more than half its tolerance in it.
+def first_step(rates: Float[Array, " n"], solver: Any, t0: Any, t1: Any, y0: Float[Array, " n"]) -> Any:
+    """The size of the first step, from ẏ at the start: no variable moves by more than half its tolerance in it.
 
     Source: K. E. Brenan, S. L. Campbell, L. R. Petzold, *Numerical Solution of Initial-Value Problems in
     Differential-Algebraic Equations*, section 5.2.4.
     """
     span = t1 - t0
     tol = tolerances(solver.rtol, solver.atol, y0.dtype)
-    speed = tol.norm(pencil.rates(t0, y0), y0)
+    speed = tol.norm(rates, y0)
     return lax.stop_gradient(jnp.sign(span) * jnp.minimum(1e-3 * jnp.abs(span), 0.5 / jnp.maximum(speed, 1e-30)))
