@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from jax import lax
 
+from dae_jax.kernels import gathered
 from dae_jax.structure import dependence, sigma_method, signature
 from dae_jax.structure.incidence import CALLS, CONTROL, RULES
 
@@ -375,3 +376,33 @@ def test_thousand_variables():
     pattern = dependence(fn, jnp.ones(2000))[0]
     assert pattern.shape == (999, 2000)
     assert pattern.sum(1).max() <= 6
+
+
+def _gather(x, i, **numbers):
+    mode = numbers.pop("mode", "fill")
+    sizes = numbers.pop("slice_sizes")
+    return x, i, jax.lax.GatherDimensionNumbers(**numbers), sizes, mode
+
+
+GATHERS = {
+    "rows": _gather((5, 3), [[4], [0], [2]], offset_dims=(1,), collapsed_slice_dims=(0,), start_index_map=(0,), slice_sizes=(1, 3)),
+    "entries, one outside": _gather(
+        (4, 3), [[0, 2], [3, 1], [4, 0]], offset_dims=(), collapsed_slice_dims=(0, 1), start_index_map=(0, 1), slice_sizes=(1, 1)
+    ),
+    "windows, clipped": _gather(
+        (5, 4), [[[3, 3]], [[-1, 0]]], offset_dims=(0, 2), collapsed_slice_dims=(), start_index_map=(1, 0),
+        slice_sizes=(2, 3), mode="clip",
+    ),
+    "a batch": _gather(
+        (2, 3), [[[1], [0]], [[2], [2]]], offset_dims=(), collapsed_slice_dims=(1,), start_index_map=(1,),
+        operand_batching_dims=(0,), start_indices_batching_dims=(0,), slice_sizes=(1, 1),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", GATHERS)
+def test_a_gather_on_numbers_is_that_of_jax(name):
+    shape, indices, numbers, sizes, mode = GATHERS[name]
+    places, indices = np.arange(np.prod(shape)).reshape(shape), np.array(indices)
+    expected = jax.lax.gather(places, indices, numbers, sizes, mode=mode, fill_value=-1)
+    np.testing.assert_array_equal(gathered(places, indices, numbers, sizes, mode), expected)

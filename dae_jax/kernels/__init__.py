@@ -1,6 +1,8 @@
 """How small functions become fast machine code: scalar arithmetic and single kernels."""
 
+from .gathers import gathered as gathered
 from .jaxprs import equations as equations, is_large as is_large
+from .numbers import on_numbers as on_numbers
 from .one_kernel import (
     PullBack as PullBack,
     configure as configure,

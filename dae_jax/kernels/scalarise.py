@@ -20,6 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 
+from .gathers import gathered
+from .numbers import on_numbers
+
 
 # Above this many scalar operations straight-line code costs more to compile than it saves at run time.
 LIMIT = 500
@@ -33,12 +36,6 @@ _STRUCTURAL = frozenset(
     "add_any broadcast_in_dim concatenate copy copy_p dot_general dynamic_slice expand_dims gather iota pad reduce_max "
     "reduce_sum reshape rev slice split squeeze stack stop_gradient transpose".split()
 )
-# Operations on two known scalars that numpy does while tracing.
-_FOLDED = {
-    "add": np.add, "and": np.logical_and, "div": np.divide, "eq": np.equal, "ge": np.greater_equal, "gt": np.greater,
-    "le": np.less_equal, "lt": np.less, "max": np.maximum, "min": np.minimum, "mul": np.multiply, "ne": np.not_equal,
-    "neg": np.negative, "not": np.logical_not, "or": np.logical_or, "sub": np.subtract,
-}  # fmt: skip
 _CALLS = {
     "closed_call": "call_jaxpr",
     "jit": "jaxpr",
@@ -177,8 +174,10 @@ class _Interpreter:
 
     def scalar(self, eqn: Any, x: list[Any]) -> Any:
         name = eqn.primitive.name
-        if name in _FOLDED and all(map(_known, x)) and eqn.outvars[0].aval.dtype in (bool, np.float64, np.float32):
-            return np.asarray(_FOLDED[name](*x), eqn.outvars[0].aval.dtype)[()]
+        if all(map(_known, x)) and eqn.outvars[0].aval.dtype in (bool, np.float64, np.float32):
+            number = on_numbers(eqn, x)
+            if number is not None:
+                return number[()]
         if name == "mul":
             return self.product(*x)
         if name == "add":
@@ -291,14 +290,11 @@ class _Interpreter:
         x, indices = args
         if not all(_known(i) for i in indices.ravel()):
             raise _NotScalar
-        params = dict(eqn.params, fill_value=None)
-        with jax.ensure_compile_time_eval():
-            positions = jnp.arange(1, x.size + 1).reshape(x.shape)
-            at = jnp.asarray(indices.astype(eqn.invars[1].aval.dtype))
-            moved = np.asarray(eqn.primitive.bind(positions, at, **params))
-        if (moved < 1).any():
+        p, places = eqn.params, np.arange(x.size).reshape(x.shape)
+        moved = gathered(places, indices.astype(int), p["dimension_numbers"], p["slice_sizes"], p["mode"])
+        if (moved < 0).any():
             raise _NotScalar
-        return _object(x.ravel()[moved.ravel() - 1], moved.shape)
+        return _object(x.ravel()[moved.ravel()], moved.shape)
 
     def dynamic_slice(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
         x, starts = args[0], [a[()] for a in args[1:]]

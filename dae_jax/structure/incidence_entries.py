@@ -5,29 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from ..kernels import on_numbers
 from .cells import Cells, evaluate, unless
 
-
-# Constants are computed by numpy where it agrees with XLA to the last bit: it needs no compilation.
-_NUMPY: dict[str, Callable[..., Any]] = {
-    "abs": np.abs,
-    "add": np.add,
-    "and": np.bitwise_and,
-    "copy": np.asarray,
-    "eq": np.equal,
-    "ge": np.greater_equal,
-    "gt": np.greater,
-    "le": np.less_equal,
-    "lt": np.less,
-    "max": np.maximum,
-    "min": np.minimum,
-    "mul": np.multiply,
-    "ne": np.not_equal,
-    "neg": np.negative,
-    "not": np.invert,
-    "or": np.bitwise_or,
-    "sub": np.subtract,
-}
 
 _ELEMENTWISE = """
     abs acos acosh add add_any and asin asinh atan atan2 atanh bessel_i0e bessel_i1e bitcast_convert_type cbrt ceil
@@ -86,10 +66,9 @@ def _values(eqn: Any, inputs: list[Cells], settled: np.ndarray) -> np.ndarray:
             result = values[0].astype(aval.dtype)
         elif name == "stop_gradient":
             result = values[0]
-        elif name in _NUMPY:
-            result = np.asarray(_NUMPY[name](*values), aval.dtype)
         else:
-            result = np.asarray(evaluate(eqn, values)[0])
+            result = on_numbers(eqn, values)
+            result = np.asarray(evaluate(eqn, values)[0]) if result is None else result
     result = np.broadcast_to(result, aval.shape)
     if not settled.any():
         return result

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..kernels import gathered
 from .cells import Cells, as_sets, union, unless
 
 
@@ -124,7 +125,7 @@ def _gathered(
     shape: tuple[int, ...], indices: Cells, numbers: Any, slice_sizes: tuple[int, ...], mode: Any
 ) -> Iterator[np.ndarray]:
     """The positions that a gather reads, for each choice of the indices that are not known; −1 outside."""
-    places = np.arange(int(np.prod(shape)), dtype=np.int32).reshape(shape)
+    places = np.arange(int(np.prod(shape)), dtype=int).reshape(shape)
     starts = [
         [None] if indices.known[..., k].all() else range(shape[axis] - slice_sizes[axis] + 1)
         for k, axis in enumerate(numbers.start_index_map)
@@ -135,8 +136,7 @@ def _gathered(
             for k, start in enumerate(choice)
         ]
         index = np.stack(columns, -1).astype(indices.value.dtype) if columns else indices.value
-        with jax.ensure_compile_time_eval():
-            yield np.asarray(jax.lax.gather(places, index, numbers, slice_sizes, mode=mode, fill_value=-1))
+        yield gathered(places, index, numbers, slice_sizes, mode)
 
 
 def _sliced(shape: tuple[int, ...], starts: list[Cells], sizes: tuple[int, ...]) -> Iterator[np.ndarray]:

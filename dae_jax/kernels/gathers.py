@@ -1,0 +1,30 @@
+"""Which entries a gather reads, found without JAX: an operation on numbers would be compiled for each shape."""
+
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Int
+
+
+def gathered(
+    places: Int[np.ndarray, "..."], indices: Int[np.ndarray, "..."], numbers: Any, slice_sizes: Any, mode: Any
+) -> Int[np.ndarray, "..."]:
+    """`jax.lax.gather(places, indices, numbers, slice_sizes, mode=mode, fill_value=-1)` on numbers."""
+    shape, sizes = np.array(places.shape, int), np.array(slice_sizes, int)
+    batch = indices.shape[:-1]
+    starts = np.zeros((*batch, len(shape)), np.int64)
+    starts[..., list(numbers.start_index_map)] = indices
+    for axis, of_batch in zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True):
+        starts[..., axis] = np.indices(batch)[of_batch]
+    inside = np.all((starts >= 0) & (starts <= shape - sizes), -1)
+    starts = np.clip(starts, 0, shape - sizes)
+    offsets = np.indices(slice_sizes).reshape(len(shape), -1).T
+    found = places[tuple(np.moveaxis(starts[..., None, :] + offsets, -1, 0))]
+    if jax.lax.GatherScatterMode.from_any(mode) is jax.lax.GatherScatterMode.FILL_OR_DROP:
+        found = np.where(inside[..., None], found, -1)
+    dropped = {*numbers.collapsed_slice_dims, *numbers.operand_batching_dims}
+    kept = (size for axis, size in enumerate(slice_sizes) if axis not in dropped)
+    found = found.reshape((*batch, *kept))
+    window = range(len(batch), found.ndim)
+    return np.moveaxis(found, tuple(window), numbers.offset_dims)
