@@ -149,7 +149,9 @@ def start_is_as_expected(
     return consistent, consistent & (smallest_pivot(_scaled_gram(ode, t, y)[2]) > jnp.finfo(y[0].dtype).eps ** 0.5)
 
 
-def consistent_state(system: System, t0: Any, y0: Any, args: Any = None, *, fixed: Any = None) -> Any:
+def consistent_state(
+    system: System, t0: Any, y0: Any, args: Any = None, *, fixed: Any = None, rates: Any = None
+) -> Any:
     """The nearest state that satisfies the equations and the hidden ones.
 
     For a `ConstrainedSystem`, positions first: the q with g(t₀, q) = 0 nearest to q₀ in the metric of the mass matrix at
@@ -160,6 +162,8 @@ def consistent_state(system: System, t0: Any, y0: Any, args: Any = None, *, fixe
 
     - `fixed`: a pytree of booleans (or boolean arrays) with the structure of `y0`; entries marked true are kept, such as
       the differential variables of a circuit.
+    - `rates`: ẏ in the structure of `y0`, where that is given: all 0 for a state of rest. It counts for the variables
+      whose derivative occurs in the equations. All entries of the state then count alike for mechanisms also.
 
     Errors: `ValueError` where no such state is found from here, naming the equations that remain off; NaN where the
     arguments are traced.
@@ -168,8 +172,12 @@ def consistent_state(system: System, t0: Any, y0: Any, args: Any = None, *, fixe
     masks = jax.tree.map(lambda x: jnp.zeros_like(x, dtype=bool), y0)
     if fixed is not None:
         masks = jax.tree.map(lambda f, x: jnp.broadcast_to(jnp.asarray(f, bool), jnp.shape(x)), fixed, y0)
-    nearest = _nearest_of_mechanism if isinstance(system, ConstrainedSystem) else _nearest_of_any
-    found, fine, remains = nearest(system, t0, y0, args, masks)
+    if rates is not None:
+        rates = jax.tree.map(lambda r, x: jnp.broadcast_to(jnp.asarray(r, x.dtype), x.shape), rates, y0)
+    if isinstance(system, ConstrainedSystem) and rates is None:
+        found, fine, remains = _nearest_of_mechanism(system, t0, y0, args, masks)
+    else:
+        found, fine, remains = _nearest_of_any(system, t0, y0, args, masks, rates)
     if not isinstance(fine, jax.core.Tracer) and not bool(fine):
         said, instead = "The initial state `y0` violates", "No consistent state was found near `y0`; left over are"
         raise ValueError(
@@ -188,12 +196,13 @@ def _nearest_of_mechanism(system: ConstrainedSystem, t: Any, y0: Any, args: Any,
 
 
 @eqx.filter_jit
-def _nearest_of_any(system: System, t: Any, y0: Any, args: Any, masks: Any) -> Any:
+def _nearest_of_any(system: System, t: Any, y0: Any, args: Any, masks: Any, rates: Any) -> Any:
     form = ResidualForm.of(system, t, y0, args)
     values = form.encode(y0)
     t = jnp.asarray(t, values.dtype)
     ode = StructuralODE.of(form, values.dtype, complete=True)
-    y = ode.start(t, values, jnp.where(form.encode(masks), 0, 1))
+    freedom = jnp.where(form.encode(masks), 0, 1)
+    y = ode.start(t, values, freedom, None if rates is None else form.encode(rates))
     remains = _left_over(ode, t, y)
     fine = remains.consistent()
     return jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), ode.decode(t, y)), fine, remains

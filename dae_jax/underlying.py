@@ -63,6 +63,15 @@ class Orders:
         return np.concatenate([first, np.full(self.size - len(first), -1)])
 
     @property
+    def first_derivatives(self) -> Int[np.ndarray, " N"]:
+        """Which variable each entry of Y is the first derivative of, −1 for others."""
+        found = np.full(self.size, -1)
+        for j, d in enumerate(self.variables):
+            if d > 1:
+                found[self.places[1][j]] = j
+        return found
+
+    @property
     def size(self) -> int:
         """The number of entries of Y."""
         return sum(self.variables)
@@ -256,13 +265,20 @@ class StructuralODE(ManifoldODE):
         """Y of a state: the derivatives of order 1 and higher are those with which the equations hold, or nearly hold."""
         return self.start(t, self.form.encode(state), jnp.zeros(self.form.size))
 
-    def start(self, t: Any, values: Float[Array, " n"], freedom: Float[Array, " n"]) -> Float[Array, " N"]:
+    def start(
+        self, t: Any, values: Float[Array, " n"], freedom: Float[Array, " n"], rates: Float[Array, " n"] | None = None
+    ) -> Float[Array, " N"]:
         """Y near the values of the variables, each of which may move as much as its `freedom` says (0: not at all; 1: no
-        more than the others), with the least H. Gauss–Newton's method, the derivatives from 0.
+        more than the others), with the least H. Gauss–Newton's method, the derivatives from 0; the first ones are
+        `rates` where that is given.
         """
         index = self.orders.values
         weights = take(freedom.astype(values.dtype), index) + np.where(index < 0, FREE, 0)
-        return _nearest(self, t, take(values, index), weights)
+        known = take(values, index)
+        if rates is not None:
+            first = self.orders.first_derivatives
+            known, weights = known + take(rates, first), jnp.where(first < 0, weights, 0)
+        return _nearest(self, t, known, weights)
 
 
 def _nearest(ode: StructuralODE, t: Any, known: Any, weights: Any) -> Any:

@@ -266,3 +266,24 @@ def test_what_is_fixed_stays():
     np.testing.assert_allclose(found[:4], [0.6, 0.8, 0.4, -0.3], atol=1e-10)
     with pytest.raises(ValueError, match="No consistent state"):
         dae_jax.consistent_state(IMPLICIT, 0.0, np.array([2.0, 0, 0, 0, 0]), fixed=fixed)
+
+
+def test_a_state_of_given_derivatives():
+    """At rest a double pendulum hangs, a capacitor is charged; charging at a given rate, it takes what flows."""
+    scene = SCENES["double-pendulum"]()
+    near = (jnp.array([0.3, 0.9, 0.5, 1.8]), jnp.zeros(4))
+    q, v = dae_jax.consistent_state(scene.system, 0.0, near, scene.args, rates=(jnp.zeros(4), jnp.zeros(4)))
+    np.testing.assert_allclose(q, [0, 1, 0, 2], atol=1e-12)
+    np.testing.assert_array_equal(v, 0)
+
+    charging = dae_jax.SemiExplicitDAE(lambda t, u, i, e: i - u / 5, lambda t, u, i, e: e - u - i / 10)
+    zero = (jnp.zeros(1), jnp.zeros(1))
+    state = lambda e, rate: dae_jax.consistent_state(charging, 0.0, zero, e, rates=(rate, zero[1]))
+    np.testing.assert_allclose(state(2.0, zero[0])[0], 2 / 1.02, rtol=1e-12)
+    u, i = state(2.0, jnp.ones(1))
+    np.testing.assert_allclose([i - u / 5, 2 - u - i / 10], [[1], [0]], atol=1e-12)
+    np.testing.assert_allclose(jax.grad(lambda e: state(e, zero[0])[0][0])(2.0), 1 / 1.02, rtol=1e-10)
+
+    growing = dae_jax.SemiExplicitDAE(lambda t, u, i, e: 1 + u**2 + 0 * i, charging.g)
+    with pytest.raises(ValueError, match="No consistent state"):
+        dae_jax.consistent_state(growing, 0.0, zero, 2.0, rates=zero)

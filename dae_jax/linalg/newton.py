@@ -89,9 +89,9 @@ def fixed_point(
         return x, size, jnp.where(last < jnp.inf, jnp.maximum(last, jnp.finfo(dtype).tiny), one), count + 1
 
     start = (x, jnp.full((), jnp.inf, dtype), one, 0) if last is None else (x, last, one, 1)
-    x, last, previous, _ = lax.while_loop(unfinished, body, start)
-    remaining = last * jnp.minimum(last / previous, 1)
-    return x, (remaining <= tolerance) | (last < 1000 * tolerance)
+    x, size, previous, _ = lax.while_loop(unfinished, body, start)
+    remaining = size * jnp.minimum(size / previous, 1)
+    return x, (remaining <= tolerance) | (size < 1000 * tolerance)
 
 
 def implicit_root(
