@@ -12,9 +12,18 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from .constraints import ManifoldODE, MechanicalODE, at_one_instant
-from .linalg import fixed_point, implicit_root, relative_change, semidefinite_solve, solve, take
+from .linalg import (
+    Tearing,
+    fixed_point,
+    implicit_root,
+    relative_change,
+    semidefinite_solve,
+    solve,
+    take,
+    tearing,
+)
 from .residual import ResidualForm
-from .structure import StructurallySingular, dependence, sigma_method, signature
+from .structure import StructurallySingular, dependence, interpreted, sigma_method, signature
 from .systems import ConstrainedSystem
 from .taylor import total_derivatives
 
@@ -104,6 +113,7 @@ class StructuralODE(ManifoldODE):
 
     form: ResidualForm
     orders: Orders = eqx.field(static=True)
+    tearing: Tearing = eqx.field(static=True)
 
     @classmethod
     def of(cls, form: ResidualForm, dtype: Any, complete: bool = False) -> "StructuralODE":
@@ -123,19 +133,26 @@ class StructuralODE(ManifoldODE):
                 f"The system is structurally singular: the equations {names} have too few variables between them. "
                 "`dae_jax.analyse(system, t0, y0, args)` names all."
             ) from None
-        ode = cls(form, Orders(found.equation_offsets, found.variable_offsets))
-        if max(found.variable_offsets) > 0 and not complete and ode._linear(y):
-            return ode
-        return cls(
-            form, Orders(*(tuple(k + 1 for k in offsets) for offsets in (ode.orders.equations, ode.orders.variables)))
-        )
+        offsets = found.equation_offsets, found.variable_offsets
+        differentiated = lambda more: cls(form, Orders(*(tuple(k + more for k in c) for c in offsets)), Tearing())
+        if complete:
+            return differentiated(1)
+        ode = differentiated(0)
+        linear, known = ode._coefficients(y) if max(found.variable_offsets) else (False, None)
+        if not linear:
+            ode = differentiated(1)
+            _, known = ode._coefficients(y)
+        return dataclasses.replace(ode, tearing=tearing(known))
 
-    def _linear(self, y: Any) -> bool:
-        """Whether the highest derivatives enter linearly: whether their coefficients do not depend on them."""
+    def _coefficients(self, y: Any) -> tuple[bool, Float[np.ndarray, "n n"]]:
+        """Whether the highest derivatives enter linearly, that is whether their coefficients do not depend on them, and
+        which of these are numbers.
+        """
         state = jax.ShapeDtypeStruct((self.orders.size,), y.dtype)
         time = jax.ShapeDtypeStruct((), y.dtype)
         coefficients = lambda t, s, x: jax.jacfwd(lambda x: self.of_highest_order(t, s, x))(x)
-        return not dependence(coefficients, time, state, y, derivative=True)[2].any()
+        (*_, on_highest), known = interpreted(coefficients, time, state, y, derivative=True)
+        return not on_highest.any(), known.reshape(self.form.size, self.form.size)
 
     # The equations and their derivatives
 
@@ -168,7 +185,7 @@ class StructuralODE(ManifoldODE):
 
     def highest(self, t: Any, y: Float[Array, " N"], feedback: Any = None) -> Float[Array, " n"]:
         """X, the derivatives of order Dⱼ."""
-        return solve(*self._system(t, y, feedback))
+        return self.tearing.solve(*self._system(t, y, feedback))
 
     # The underlying ODE and the manifold
 

