@@ -3,7 +3,13 @@
 from .analyse import Structure as Structure, analyse as analyse
 from .baumgarte_loss import BaumgarteLoss as BaumgarteLoss, baumgarte_loss as baumgarte_loss
 from .diagnostics import Drift as Drift, drift as drift, energy as energy, multipliers as multipliers
-from .explain import MechanicalPlan as MechanicalPlan, Plan as Plan, ResidualPlan as ResidualPlan, explain as explain
+from .explain import (
+    MechanicalPlan as MechanicalPlan,
+    Plan as Plan,
+    ResidualPlan as ResidualPlan,
+    StructuralPlan as StructuralPlan,
+    explain as explain,
+)
 from .formulations import (
     GGL as GGL,
     AbstractFormulation as AbstractFormulation,

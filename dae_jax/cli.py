@@ -110,7 +110,10 @@ def _analyse(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> 
     if arguments.out is not None:
         from .plotting import incidence
 
-        incidence(structure, arguments.system).savefig(arguments.out)
+        try:
+            incidence(structure, arguments.system).savefig(arguments.out)
+        except (OSError, ValueError) as refusal:
+            parser.error(str(refusal))
     return 0
 
 

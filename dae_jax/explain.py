@@ -18,11 +18,12 @@ from .normals import SparseNormals
 from .pencil import Pencil
 from .program import Solve
 from .solve import prepared
+from .underlying import StructuralODE
 
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """How a system is solved; `print` it. `explain` gives a `MechanicalPlan` or a `ResidualPlan`.
+    """How a system is solved; `print` it. `explain` gives a `MechanicalPlan`, a `StructuralPlan` or a `ResidualPlan`.
 
     - `method`: formulation and solver, in words.
     - `linear_solver`: how the linear systems of a step are solved.
@@ -88,6 +89,30 @@ class MechanicalPlan(Plan):
 
 
 @dataclasses.dataclass(frozen=True)
+class StructuralPlan(Plan):
+    """Of the underlying ODE that structural analysis finds for any system.
+
+    - `unknowns`, `state`: how many the equations have, and of how many numbers the state of the ODE consists.
+    - `differentiated`: how often each equation is differentiated.
+    - `invariants`: the constraints and the hidden ones.
+    """
+
+    unknowns: int
+    state: int
+    differentiated: tuple[int, ...]
+    invariants: int
+
+    def _found(self) -> dict[str, str]:
+        often = [f"{self.differentiated.count(k)} of them {k} times" for k in sorted(set(self.differentiated)) if k]
+        return {
+            "system": f"{self.unknowns} equations, differentiated: {', '.join(often) or 'none'}",
+            "underlying ODE": f"{self.state} numbers with {self.invariants} invariants",
+            "linear systems": self.linear_solver,
+            "field": f"{self.operations} operations",
+        }
+
+
+@dataclasses.dataclass(frozen=True)
 class ResidualPlan(Plan):
     """Of 0 = F(t, y, ẏ) as it is written.
 
@@ -143,10 +168,24 @@ def explain(
     kernel, arrays = solve.kernel(*inputs[1:], rank)
     found = hindrances(jax.make_jaxpr(without_checks(kernel))(arrays))
     enabled = one_kernel_enabled() and jax.default_backend() == "cpu" and solve.derivative() != "any"
-    method = f"{_name(solve.formulation)}, {_name(solver)}"
+    method = f"{_name(formulation or solve.formulation)}, {_name(solver)}"
     if isinstance(solve.formulation, Residual):
         y, pencil = solve.formulation.encode(system, t0, y0, args)
         return _of_residual(pencil, t0, y, method, enabled and not found, found)
+    y, ode = solve.formulation.encode(system, t0, y0, args, rank)
+    if isinstance(ode, StructuralODE):
+        return StructuralPlan(
+            method=method,
+            linear_solver=ode.tearing.describe(ode.form.size),
+            operations=_operations(lambda y: ode.field(t0, y), y),
+            one_kernel=enabled and not found,
+            hindrances=found,
+            left_out=() if solve.between() else ("dense output",),
+            unknowns=ode.form.size,
+            state=ode.orders.size,
+            differentiated=ode.orders.equations,
+            invariants=sum(ode.orders.equations),
+        )
     ode = MechanicalODE.of(system, t0, y0, args, rank)
     count = ode.holonomic + ode.nonholonomic
     sparse = ode.linear if isinstance(ode.linear, SparseNormals) else None

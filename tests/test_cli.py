@@ -19,7 +19,8 @@ def test_compare_writes_table_data_and_figures(tmp_path, capsys):
     assert all(np.isfinite(float(row["error"])) for row in rows)
     assert (tmp_path / "drift.png").stat().st_size > 10_000
     assert "projection-tsit5" in capsys.readouterr().out
-    assert np.load(tmp_path / "solutions.npz")["rattle_q"].shape == (501, 2)
+    with np.load(tmp_path / "solutions.npz") as data:
+        assert data["rattle_q"].shape == (501, 2)
 
 
 def test_compare_takes_problems_that_are_no_mechanisms(tmp_path, capsys):
@@ -27,13 +28,15 @@ def test_compare_takes_problems_that_are_no_mechanisms(tmp_path, capsys):
     out = capsys.readouterr().out
     assert "errors relative" in out
     assert "–" in out
-    assert np.load(tmp_path / "solutions.npz")["radau_x"].shape == (501, 4)
+    with np.load(tmp_path / "solutions.npz") as data:
+        assert data["radau_x"].shape == (501, 4)
     assert (tmp_path / "solution-radau.png").stat().st_size > 10_000
 
 
 def test_sweep_draws_the_map_of_alpha_and_beta(tmp_path, capsys):
     assert main(["sweep", "pendulum", "--points", "6", "--t1", "1", "--out", str(tmp_path)]) == 0
-    found = np.load(tmp_path / "baumgarte-pendulum.npz")
+    with np.load(tmp_path / "baumgarte-pendulum.npz") as data:
+        found = dict(data)
     assert found["loss"].shape == (6, 6)
     # α = β = 10⁴ at steps of 0.05 s is far beyond what an explicit method can.
     assert found["failed"][-1, -1]
@@ -44,7 +47,8 @@ def test_sweep_draws_the_map_of_alpha_and_beta(tmp_path, capsys):
 
 def test_sweep_draws_the_maps_of_initial_angles(tmp_path):
     assert main(["sweep", "angles", "--points", "6", "--t1", "4", "--out", str(tmp_path)]) == 0
-    found = np.load(tmp_path / "angles-flip.npz")
+    with np.load(tmp_path / "angles-flip.npz") as data:
+        found = dict(data)
     # Both arms near the top turn over, both near the bottom do not; the map is symmetric about the middle.
     assert np.isinf(found["flip"][2:4, 2:4]).all()
     assert np.isfinite(found["flip"]).any()
@@ -59,7 +63,8 @@ def test_tune_prints_what_it_found_and_verifies_it(tmp_path, capsys):
     out = capsys.readouterr().out
     assert "α = " in out
     assert "verified with rtol 1e-11" in out
-    assert np.load(tmp_path / "tune-pendulum.npz")["alpha"].shape == (1, 10)
+    with np.load(tmp_path / "tune-pendulum.npz") as data:
+        assert data["alpha"].shape == (1, 10)
 
 
 def test_analyse_prints_and_draws_a_system_of_a_module(tmp_path, monkeypatch, capsys):
@@ -70,6 +75,10 @@ def test_analyse_prints_and_draws_a_system_of_a_module(tmp_path, monkeypatch, ca
     assert main(["analyse", "mine:integrator", "--out", "incidence.png"]) == 0
     assert "1 equations, index 0, 1 degrees of freedom" in capsys.readouterr().out
     assert (tmp_path / "incidence.png").stat().st_size > 10_000
+    for unwritable in ("incidence.xyz", "no-such-folder/incidence.png"):
+        with pytest.raises(SystemExit) as end:
+            main(["analyse", "mine:integrator", "--out", unwritable])
+        assert end.value.code == 2
 
 
 def test_a_method_that_does_not_apply_says_why(tmp_path, capsys):

@@ -121,3 +121,16 @@ def test_a_large_residual_has_a_band_and_few_directional_derivatives():
     assert found.linear_solver.startswith("a band of 1 diagonals below and 1 above")
     assert found.one_kernel
     assert found.indices == (0,) * n
+
+
+def test_any_system_by_its_underlying_ode():
+    found = plan(SCENES["akzo-nobel"]())
+    assert (found.unknowns, found.state, found.invariants) == (6, 11, 6)
+    assert "none needs pivoting" in str(found)
+    assert found.one_kernel
+    jay = plan(SCENES["jay"]())
+    assert "5 with pivoting, in a loop over columns" in jay.linear_solver
+    dummy = plan(SCENES["pendulum"](), dae_jax.BDF(), formulation=dae_jax.DummyDerivatives())
+    assert dummy.method == "DummyDerivatives, BDF"
+    explicit = plan(SCENES["pendulum"](), dae_jax.DOP853(), formulation=dae_jax.DummyDerivatives())
+    assert isinstance(explicit, dae_jax.StructuralPlan)

@@ -1,5 +1,6 @@
 """Radau IIA with three stages for 0 = F(t, y, ẏ)."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
@@ -92,12 +93,17 @@ class _Step(NamedTuple):
         times = [self.t1 if c == 1 else self.t0 + float(c) * self.h for c in NODES]
         return [(self.sign * t, self.y0 + z[i], rates[i] * (self.sign / self.h)) for i, t in enumerate(times)]
 
+    def at_stages(self, fn: Callable[..., Any], z: Float[Array, "3 n"]) -> list[Any]:
+        """fn(t, y, ẏ) at each stage: in a loop where it is large."""
+        stages = self.stages(z)
+        if not is_large(fn, *stages[0]):
+            return [fn(*stage) for stage in stages]
+        found = lax.map(lambda stage: fn(*stage), jax.tree.map(lambda *x: jnp.stack(x), *stages))
+        return [jax.tree.map(lambda x, i=i: x[i], found) for i in range(3)]
+
     def residuals(self, z: Float[Array, "3 n"]) -> list[Float[Array, " n"]]:
         """F at the stages."""
-        stages = self.stages(z)
-        if not is_large(self.pencil.residual, *stages[0]):
-            return [self.pencil.residual(*stage) for stage in stages]
-        return list(lax.map(lambda stage: self.pencil.residual(*stage), jax.tree.map(lambda *x: jnp.stack(x), *stages)))
+        return self.at_stages(self.pencil.residual, z)
 
     def jacobians(self, t: Any, y: Any, yd: Any) -> tuple[Any, Any]:
         """∂F/∂y and ∂F/∂(dy/dτ) for the loop's own time τ = ± t."""
@@ -247,7 +253,7 @@ def _error(step: _Step, factor: Any, z: Any, tol: Tolerances) -> Float[Array, " 
 
 def _coupled(step: _Step, z: Float[Array, "3 n"]) -> Any:
     """The Jacobian of all stages at the solution, in the storage of their unknowns interleaved."""
-    found = [step.jacobians(*stage) for stage in step.stages(z)]
+    found = step.at_stages(step.jacobians, z)
     storage, matrix = step.pencil.storage.coupled(
         [j for j, _ in found], [m for _, m in found], jnp.asarray(INVERSE, z.dtype) / step.h
     )
