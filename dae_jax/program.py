@@ -217,7 +217,6 @@ class Solve(eqx.Module):
         solver, controller = _economical(self.solver, self.between()), _fitted(self.controller, t0, t1)
         if isinstance(self.formulation, Residual):
             solver, controller = _of_residuals(solver, controller)
-            ode = ode.starting(t0, y)
             dt0 = first_step(ode.start, solver, t0, t1, y) if dt0 is None else dt0
 
         def saved(part: Any) -> Any:

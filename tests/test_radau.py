@@ -295,3 +295,15 @@ def test_float32():
     )  # fmt: skip
     assert sol.ys.dtype == jnp.float32
     assert scene.error(np.asarray([scene.t1]), sol.ys) < 1e-2
+
+
+@pytest.mark.parametrize("solver", [dae_jax.RadauIIA5(rtol=1e-8, atol=1e-8), dae_jax.BDF(rtol=1e-8, atol=1e-8)])
+def test_with_diffrax_itself(solver):
+    scene, formulation = SCENES["hessenberg-2"](), dae_jax.Residual()
+    y0, ode = formulation.encode(scene.system, 0.0, scene.y0)
+    sol = diffrax.diffeqsolve(
+        formulation.term(), solver, 0.0, scene.t1, 1e-4, y0, args=ode,
+        stepsize_controller=diffrax.PIDController(rtol=1e-8, atol=1e-8),
+    )  # fmt: skip
+    end = jax.tree.map(lambda x: x[None], formulation.decode(scene.t1, sol.ys[-1], ode))
+    assert scene.error(np.array([scene.t1]), end) < 1e-6

@@ -44,4 +44,4 @@ class ReducedResidual(Residual):
         z = form.encode(t, y)
         # The selection changes: the structure is that of all of them.
         pencil = Pencil.of(form.with_all_candidates(y.dtype), z)
-        return z, eqx.tree_at(lambda p: p.form, pencil, form)
+        return z, eqx.tree_at(lambda p: p.form, pencil, form).starting(t, z)

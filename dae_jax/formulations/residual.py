@@ -59,7 +59,7 @@ class Residual(AbstractFormulation):
                 f"as they are written converge for an index up to {HIGHEST} only. Solve the underlying ODE: "
                 "OrthogonalProjection(DOP853())."
             )
-        return y, pencil
+        return y, pencil.starting(t, y)
 
     def field(self, t: Any, y: Any, ode: Any) -> Any:
         """NaN: a residual has no ẏ in explicit form."""
