@@ -305,5 +305,6 @@ def test_with_diffrax_itself(solver):
         formulation.term(), solver, 0.0, scene.t1, 1e-4, y0, args=ode,
         stepsize_controller=diffrax.PIDController(rtol=1e-8, atol=1e-8),
     )  # fmt: skip
+    assert sol.ys is not None
     end = jax.tree.map(lambda x: x[None], formulation.decode(scene.t1, sol.ys[-1], ode))
     assert scene.error(np.array([scene.t1]), end) < 1e-6
