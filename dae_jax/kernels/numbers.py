@@ -1,5 +1,6 @@
 """Arithmetic on numbers that are known while tracing, by numpy: JAX would compile a program for each shape."""
 
+import functools
 import math
 from typing import Any
 
@@ -12,8 +13,15 @@ _EXACT = {
     "gt": np.greater, "le": np.less_equal, "lt": np.less, "max": np.maximum, "min": np.minimum, "mul": np.multiply,
     "ne": np.not_equal, "neg": np.negative, "not": np.invert, "or": np.bitwise_or, "sub": np.subtract,
 }  # fmt: skip
+
+
+@functools.partial(np.vectorize, otypes=[float])
+def _lgamma(x: float) -> float:
+    return math.lgamma(x) if x > 0 or x % 1 else math.inf
+
+
 # Taylor arithmetic makes factorials of the last two, which are right to round-off.
-_OF_FLOATS = {"div": np.divide, "exp": np.exp, "lgamma": np.vectorize(math.lgamma)}
+_OF_FLOATS = {"div": np.divide, "exp": np.exp, "lgamma": _lgamma}
 
 
 def on_numbers(eqn: Any, values: list[Any]) -> np.ndarray | None:
