@@ -9,17 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .offsets import Combination, Offsets, find_offsets
 from .residual import ResidualForm
-from .structure import (
-    Block,
-    StructurallySingular,
-    block_triangular,
-    dependence,
-    jacobian_pattern,
-    pantelides,
-    sigma_method,
-    signature,
-)
+from .structure import Block, block_triangular, pantelides
 from .systems import System
 from .taylor import total_derivatives
 
@@ -32,8 +24,10 @@ DRAWN = 60
 class Structure:
     """What structural analysis finds in 0 = F(t, y, ẏ); `print` it.
 
-    - `equations`, `variables`: names.
-    - `signature`: for each equation, its variables with the highest derivative that occurs, 0 or 1.
+    - `equations`, `variables`: names. An equation whose highest derivatives cancel against those of others is replaced by
+      the combination in which they are gone, `residual[1] + residual[0]`.
+    - `signature`: for each equation, its variables with the highest derivative that occurs: 0 or 1, more in a combination
+      with derivatives of equations.
     - `index`: the structural index, an upper bound of the differential index where `regular`.
     - `degrees_of_freedom`: how many initial values can be chosen.
     - `equation_offsets`, `variable_offsets`: c and d; equation i is to be differentiated cᵢ times, and then determines
@@ -51,6 +45,7 @@ class Structure:
     """
 
     form: ResidualForm = dataclasses.field(repr=False)
+    combination: Combination = dataclasses.field(repr=False)
     signature: tuple[dict[int, int], ...] = dataclasses.field(repr=False)
     index: int
     degrees_of_freedom: int
@@ -64,7 +59,7 @@ class Structure:
     @property
     def equations(self) -> tuple[str, ...]:
         """A name for each equation."""
-        return self.form.equations
+        return self.combination.names(self.form.equations)
 
     @property
     def variables(self) -> tuple[str, ...]:
@@ -82,11 +77,12 @@ class Structure:
         return max((abs(i - j) for i, row in enumerate(self.signature) for j in row), default=0)
 
     def derivative(self, times: int) -> Callable[[Any, Float[Array, "orders n"]], Float[Array, " n"]]:
-        """dᵏF/dtᵏ for k = `times`, as a function of t and of (y, ẏ, …, y^(k+1)), one below the other."""
+        """The k-th derivative of the `equations`, k = `times`, as a function of t and of (y, ẏ, …), one below the other."""
 
         def along(t: Any, derivatives: Float[Array, "orders n"]) -> Float[Array, " n"]:
             t = jnp.asarray(t, derivatives.dtype)
-            return total_derivatives(self.form.residual, t, list(derivatives), times + 1)[times]
+            count = times + 1 + self.combination.degree
+            return self.combination.of(total_derivatives(self.form.residual, t, list(derivatives), count))[times]
 
         return along
 
@@ -123,7 +119,7 @@ class Structure:
     def _cell(self, row: dict[int, int], i: int, j: int) -> str:
         if j not in row:
             return " ·  "
-        mark = "x'" if row[j] else "x"
+        mark = "x" + "'" * row[j]
         return (f"[{mark}]" if self.transversal[i] == j else f" {mark}").ljust(4)
 
 
@@ -139,25 +135,20 @@ def analyse(system: System, t0: Any, y0: Any, args: Any = None) -> Structure:
     y0 = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
     form = ResidualForm.of(system, t0, y0, args)
     y = form.encode(y0)
-    t = jnp.asarray(t0, y.dtype)
-    _, on_y, on_rate = dependence(form.residual, t, y, y)
-    found = signature(on_y, on_rate)
-    try:
-        sigma = sigma_method(found)
-    except StructurallySingular as singular:
-        raise ValueError(_singular(form, singular)) from None
-    pattern = jacobian_pattern(found, sigma.equation_offsets, sigma.variable_offsets)
+    found = find_offsets(form, y.dtype)
+    sigma = found.sigma
     return Structure(
         form,
-        tuple(found),
-        sigma.index,
+        found.combination,
+        tuple(found.signature),
+        found.index,
         sigma.degrees_of_freedom,
         sigma.equation_offsets,
         sigma.variable_offsets,
-        pantelides(found).equation_offsets,
+        pantelides(found.signature).equation_offsets,
         sigma.transversal,
-        tuple(block_triangular(pattern, sigma.transversal)),
-        _regular(form, t, y, pattern, found),
+        tuple(block_triangular(found.pattern, sigma.transversal)),
+        _regular(form, found, jnp.asarray(t0, y.dtype), y),
     )
 
 
@@ -169,28 +160,23 @@ def _differentiated(times: int) -> str:
     )
 
 
-def _singular(form: ResidualForm, singular: StructurallySingular) -> str:
-    parts = []
-    if singular.equations:
-        names = ", ".join(form.equations[i] for i in singular.equations)
-        parts.append(f"the equations {names} have too few variables between them")
-    if singular.variables:
-        names = ", ".join(form.variables[j] for j in singular.variables)
-        parts.append(f"the variables {names} have too few equations between them")
-    return f"The system is structurally singular: {'; '.join(parts)}."
-
-
-def _regular(form: ResidualForm, t: Any, y: Any, pattern: list[list[int]], found: list[dict[int, int]]) -> bool:
+def _regular(form: ResidualForm, found: Offsets, t: Any, y: Any) -> bool:
     """Whether the system Jacobian has full rank at the state, for generic derivatives and multipliers."""
     rng = np.random.default_rng(0)
-    wanted = np.zeros((2, len(y), len(y)), bool)
-    for i, variables in enumerate(pattern):
+    count = found.combination.degree + 1
+    wanted = np.zeros((count + 1, len(y), len(y)), bool)
+    for i, variables in enumerate(found.pattern):
         for j in variables:
-            wanted[found[i][j], i, j] = True
+            wanted[found.signature[i][j], i, j] = True
+
+    def combined(orders: Any) -> Any:
+        return found.combination.of(total_derivatives(form.residual, t, list(orders), count))[0]
+
     for _ in range(3):
         at = y.at[form.layout.size :].set(rng.normal(size=form.extra))
-        by_y, by_rate = jax.jacfwd(form.residual, (1, 2))(t, at, jnp.asarray(rng.normal(size=len(y)), y.dtype))
-        matrix = np.where(wanted[0], by_y, 0) + np.where(wanted[1], by_rate, 0)
+        orders = jnp.stack([at, *jnp.asarray(rng.normal(size=(count, len(y))), y.dtype)])
+        slopes = np.moveaxis(np.asarray(jax.jacfwd(combined)(orders)), 1, 0)
+        matrix = np.where(wanted, slopes, 0).sum(0)
         rows = np.abs(matrix).max(1, keepdims=True)
         if (rows > 0).all() and np.isfinite(matrix).all():
             values = np.linalg.svd(matrix / rows, compute_uv=False)

@@ -99,7 +99,7 @@ def unsolved(system: System, t: Any, state: Any, args: Any) -> Unsolved:
 
 def _left_over(ode: StructuralODE, t: Any, y: Float[Array, " N"]) -> Unsolved:
     terms = jnp.sum(jnp.abs(ode.normals(t, y)), 1) * (1 + jnp.max(jnp.abs(y)))
-    return Unsolved(ode.violations(t, y), jnp.finfo(y.dtype).eps ** 0.5 * terms, ode.orders.names(ode.form))
+    return Unsolved(ode.violations(t, y), jnp.finfo(y.dtype).eps ** 0.5 * terms, ode.invariant_names)
 
 
 class Redundancy(eqx.Module):

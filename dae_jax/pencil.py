@@ -13,18 +13,17 @@ from jaxtyping import Array, Bool, Float, Inexact, Int
 from .constraints import at_one_instant
 from .linalg.dense import LOOPED
 from .linalg.storage import Banded, Dense, Storage
+from .offsets import Combination, Offsets, find_offsets
 from .reduced import ReducedForm
 from .residual import ResidualForm
 from .structure import (
-    StructurallySingular,
     bandwidth,
     column_colouring,
-    dependence,
+    highest_value_transversal,
     reverse_cuthill_mckee,
     seed_matrix,
     sigma_method,
     signature,
-    variable_indices,
 )
 
 
@@ -48,8 +47,9 @@ class Outline:
     """What is known of a residual's linearisation before it is evaluated. Compared by identity: keep one for a pattern.
 
     `indices`, `offsets`: the index of each variable, and how often it is differentiated (d of the Σ-method);
-    `differential`: whether its derivative occurs; `hidden`: whether an equation must be differentiated; `by_y`,
-    `by_rate`: the compressed Jacobians, `None` for small ones.
+    `differential`: whether its derivative occurs; `hidden`: whether an equation must be differentiated to see which values
+    are consistent; `combination`: of the rows, before these are factored; `by_y`, `by_rate`: the compressed Jacobians,
+    `None` for small ones.
     """
 
     storage: Storage
@@ -57,6 +57,7 @@ class Outline:
     offsets: tuple[int, ...]
     differential: Bool[np.ndarray, " n"]
     hidden: bool
+    combination: Combination
     by_y: Compression | None
     by_rate: Compression | None
 
@@ -79,24 +80,17 @@ class Pencil(eqx.Module):
 
         Errors: `ValueError` for a structurally singular system.
         """
-        like = jax.ShapeDtypeStruct(y.shape, y.dtype)
         try:
-            time = jax.ShapeDtypeStruct((), y.dtype)
-            _, on_y, on_rate = dependence(form.residual, time, like, like, derivative=True)
+            found = find_offsets(form, y.dtype)
         except NotImplementedError:
             # A primitive that structural analysis does not know: all may depend on all.
-            on_y = on_rate = np.ones((y.size, y.size), bool)
-        try:
-            outline = _outline(on_y.tobytes(), on_rate.tobytes(), y.size)
-        except StructurallySingular as singular:
-            equations = ", ".join(form.equations[i] for i in singular.equations)
-            raise ValueError(
-                f"The system is structurally singular: the equations {equations or '(none)'} have too few variables between "
-                "them, or some variables too few equations. `dae_jax.analyse(system, t0, y0, args)` names them all."
-            ) from None
-        if indices is not None:
-            outline = dataclasses.replace(outline, indices=indices)
-        return cls(form, outline)
+            full = np.ones((y.size, y.size), bool)
+            rows = signature(full, full)
+            found = Offsets(full, full, rows, sigma_method(rows))
+        patterns = found.by_y.tobytes(), found.by_rate.tobytes()
+        indices = indices or found.indices
+        offsets = found.sigma.variable_offsets
+        return cls(form, _outline(*patterns, indices, offsets, found.index > 1, found.combination))
 
     @property
     def storage(self) -> Storage:
@@ -136,11 +130,12 @@ class Pencil(eqx.Module):
         """The factors of J + c M, for c of the order of 1/h, and the smallest pivot, of round-off size for a singular one.
 
         With column j scaled by h^dⱼ, the rows tend with h → 0 to those of the Σ-method's system Jacobian, however high the
-        index; without, the condition would grow like h^(−index).
+        index, or of the combination's; without, the condition would grow like h^(−index).
         """
         scale = self.column_scale(h)
-        factors, smallest = self.storage.factor(self.storage.scale_columns(j + c * m, scale))
-        return (factors, scale), smallest
+        matrix = self.storage.scale_columns(self._combined(j + c * m, c), scale)
+        factors, smallest = self.storage.factor(matrix)
+        return (factors, scale, c), smallest
 
     def column_scale(self, h: Any) -> Float[Array, " n"]:
         """h^dⱼ."""
@@ -148,8 +143,13 @@ class Pencil(eqx.Module):
 
     def solve(self, factors: Any, b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
         """x with (J + c M) x = b."""
-        inner, scale = factors
-        return scale * self.storage.solve(inner, b)
+        inner, scale, c = factors
+        return scale * self.storage.solve(inner, self._combined(b, c))
+
+    def _combined(self, rows: Any, c: Any) -> Any:
+        """Rows, or right-hand sides, in the combination in which highest derivatives do not cancel, with c for d/dt."""
+        combination = self.outline.combination
+        return combination.of([rows * c**k for k in range(combination.degree + 1)])[0]
 
     def rates(self, t: Any, y: Float[Array, " n"]) -> Float[Array, " n"]:
         """ẏ with F(t, y, ẏ) = 0 where y is consistent, else with the least F; for variables whose derivative does not occur
@@ -192,24 +192,31 @@ def powers(x: Float[Array, ""], exponents: tuple[int, ...]) -> Float[Array, " n"
 
 
 @functools.lru_cache(maxsize=64)
-def _outline(on_y: bytes, on_rate: bytes, n: int) -> Outline:
+def _outline(
+    on_y: bytes,
+    on_rate: bytes,
+    indices: tuple[int, ...],
+    offsets: tuple[int, ...],
+    hidden: bool,
+    combination: Combination,
+) -> Outline:
+    n = len(indices)
     by_y, by_rate = (np.frombuffer(x, bool).reshape(n, n) for x in (on_y, on_rate))
-    found = signature(by_y, by_rate)
-    sigma = sigma_method(found)
-    storage = _storage(by_y | by_rate, sigma.transversal)
+    storage = _storage(by_y | by_rate, highest_value_transversal(signature(by_y, by_rate)))
     small = n <= LOOPED
     return Outline(
         storage,
-        variable_indices(found, sigma),
-        sigma.variable_offsets,
+        indices,
+        offsets,
         by_rate.any(0),
-        any(sigma.equation_offsets),
+        hidden,
+        combination if isinstance(storage, Dense) else Combination(),
         None if small else _compression(by_y, storage),
         None if small else _compression(by_rate, storage),
     )
 
 
-def _storage(pattern: Bool[np.ndarray, "n n"], transversal: tuple[int, ...]) -> Storage:
+def _storage(pattern: Bool[np.ndarray, "n n"], transversal: list[int]) -> Storage:
     """A band, with each equation in the place of its variable, where that is cheaper."""
     n = len(pattern)
     if n <= LOOPED:

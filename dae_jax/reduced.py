@@ -36,7 +36,17 @@ class ReducedForm(eqx.Module):
     @property
     def equations(self) -> tuple[str, ...]:
         """A name for each equation."""
-        return (*(f"state[{i}]" for i in range(self.ode.orders.size)), *self.ode.form.equations)
+        return (*(f"state[{i}]" for i in range(self.ode.orders.size)), *self.ode.equations)
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """A name for each unknown."""
+        return (*(f"state[{i}]" for i in range(self.ode.orders.size)), *self.ode.form.variables)
+
+    @property
+    def may_cancel(self) -> bool:
+        """Whether highest derivatives may cancel between equations."""
+        return False
 
     def encode(self, t: Any, y: Float[Array, " N"]) -> Float[Array, " z"]:
         """(Y, X)."""

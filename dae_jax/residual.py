@@ -70,6 +70,11 @@ class ResidualForm(eqx.Module):
         return self.layout.size + self.extra
 
     @property
+    def may_cancel(self) -> bool:
+        """Whether highest derivatives may cancel between equations: for a mechanism where constraints are redundant only."""
+        return not isinstance(self.system, ConstrainedSystem)
+
+    @property
     def variables(self) -> tuple[str, ...]:
         """A name for each unknown."""
         if isinstance(self.system, ImplicitDAE):

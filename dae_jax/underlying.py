@@ -22,8 +22,9 @@ from .linalg import (
     take,
     tearing,
 )
+from .offsets import Combination, derivative_of, find_offsets
 from .residual import ResidualForm
-from .structure import StructurallySingular, dependence, interpreted, sigma_method, signature
+from .structure import interpreted
 from .systems import ConstrainedSystem
 from .taylor import total_derivatives
 
@@ -93,11 +94,6 @@ class Orders:
         """Where in Y the derivative of order Dⱼ − k of each variable is, a dummy derivative at level k; −1: nowhere."""
         return np.array([self.places[d - k][j] if d >= k else -1 for j, d in enumerate(self.variables)])
 
-    def names(self, form: ResidualForm) -> tuple[str, ...]:
-        """A name for each invariant, in the order of `StructuralODE.invariants`."""
-        marks = ("", "d/dt ", *(f"d^{k}/dt^{k} " for k in range(2, 10)))
-        return tuple(marks[k] + form.equations[i] for k in range(max(self.equations)) for i in self.rows(k))
-
 
 class StructuralODE(ManifoldODE):
     """From the offsets c of the equations and d of the variables (Pryce's Σ-method): the equations Fᵢ^(Cᵢ) = 0 are linear
@@ -106,12 +102,14 @@ class StructuralODE(ManifoldODE):
         H = (Fᵢ^(k), k < Cᵢ) = 0
 
     are the invariants: the constraints and the hidden ones. C = c and D = d where Fᵢ^(cᵢ) is linear in X; else, and where
-    a derivative of order 0 would have to be found from a nonlinear equation, each is differentiated once more.
+    a derivative of order 0 would have to be found from a nonlinear equation, each is differentiated once more. Where
+    highest derivatives cancel between equations, F stands for their `combination`.
 
     Source: J. D. Pryce, BIT 41 (2001), 364–394.
     """
 
     form: ResidualForm
+    combination: Combination = eqx.field(static=True)
     orders: Orders = eqx.field(static=True)
     tearing: Tearing = eqx.field(static=True)
 
@@ -122,45 +120,46 @@ class StructuralODE(ManifoldODE):
 
         Errors: `ValueError` for a structurally singular system.
         """
-        y = jax.ShapeDtypeStruct((form.size,), dtype)
-        time = jax.ShapeDtypeStruct((), y.dtype)
-        _, on_y, on_rate = dependence(form.residual, time, y, y, derivative=True)
-        try:
-            found = sigma_method(signature(on_y, on_rate))
-        except StructurallySingular as singular:
-            names = ", ".join(form.equations[i] for i in singular.equations)
-            raise ValueError(
-                f"The system is structurally singular: the equations {names} have too few variables between them. "
-                "`dae_jax.analyse(system, t0, y0, args)` names all."
-            ) from None
-        offsets = found.equation_offsets, found.variable_offsets
-        differentiated = lambda more: cls(form, Orders(*(tuple(k + more for k in c) for c in offsets)), Tearing())
+        found = find_offsets(form, dtype)
+        offsets = found.sigma.equation_offsets, found.sigma.variable_offsets
+
+        def differentiated(more: int) -> "StructuralODE":
+            return cls(form, found.combination, Orders(*(tuple(k + more for k in c) for c in offsets)), Tearing())
+
         if complete:
             return differentiated(1)
         ode = differentiated(0)
-        linear, known = ode._coefficients(y) if max(found.variable_offsets) else (False, None)
+        linear, known = ode._coefficients(dtype) if max(found.sigma.variable_offsets) else (False, np.zeros(0))
         if not linear:
             ode = differentiated(1)
-            _, known = ode._coefficients(y)
-        return dataclasses.replace(ode, tearing=tearing(known))
+            _, known = ode._coefficients(dtype)
+        present = np.zeros_like(known, bool)
+        for i, variables in enumerate(found.pattern):
+            present[i, variables] = True
+        return dataclasses.replace(ode, tearing=tearing(np.where(present, known, 0)))
 
-    def _coefficients(self, y: Any) -> tuple[bool, Float[np.ndarray, "n n"]]:
+    def _coefficients(self, dtype: Any) -> tuple[bool, Float[np.ndarray, "n n"]]:
         """Whether the highest derivatives enter linearly, that is whether their coefficients do not depend on them, and
         which of these are numbers.
         """
-        state = jax.ShapeDtypeStruct((self.orders.size,), y.dtype)
-        time = jax.ShapeDtypeStruct((), y.dtype)
+        time, state, y = (jax.ShapeDtypeStruct(shape, dtype) for shape in ((), (self.orders.size,), (self.form.size,)))
         coefficients = lambda t, s, x: jax.jacfwd(lambda x: self.of_highest_order(t, s, x))(x)
         (*_, on_highest), known = interpreted(coefficients, time, state, y, derivative=True)
         return not on_highest.any(), known.reshape(self.form.size, self.form.size)
 
     # The equations and their derivatives
 
+    @property
+    def equations(self) -> tuple[str, ...]:
+        """A name for each equation."""
+        return self.combination.names(self.form.equations)
+
     def levels(self, t: Any, y: Float[Array, " N"], x: Float[Array, " n"], count: int) -> list[Float[Array, " n"]]:
         """F, dF/dt, … at (Y, X): `count` of them, each right in the equations of which only Y and X are needed."""
         both = jnp.concatenate([y, x])
         orders = [take(both, place) for place in self.orders.places]
-        return total_derivatives(self.form.residual, jnp.asarray(t, y.dtype), orders, count)
+        more = count + self.combination.degree
+        return self.combination.of(total_derivatives(self.form.residual, jnp.asarray(t, y.dtype), orders, more))
 
     def of_highest_order(self, t: Any, y: Any, x: Any) -> Float[Array, " n"]:
         """Fᵢ^(Cᵢ)."""
@@ -200,6 +199,12 @@ class StructuralODE(ManifoldODE):
             return (jnp.zeros(0, y.dtype),)
         levels = self.levels(t, y, jnp.zeros(self.form.size, y.dtype), highest)
         return tuple(take(level, self.orders.rows(k)) for k, level in enumerate(levels))
+
+    @property
+    def invariant_names(self) -> tuple[str, ...]:
+        """A name for each invariant."""
+        levels = range(max(self.orders.equations))
+        return tuple(derivative_of(self.equations[i], k) for k in levels for i in self.orders.rows(k))
 
     def violations(self, t: Any, y: Any) -> Float[Array, " m"]:
         """H(t, Y), all levels."""

@@ -1,11 +1,14 @@
 """Index, offsets and degrees of freedom against the published ones, and verdicts on systems that mislead."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import dae_jax
 from dae_jax.cli import main
+from dae_jax.offsets import find_offsets
+from dae_jax.residual import ResidualForm
 from dae_jax.scenes import SCENES, chain
 
 
@@ -76,12 +79,74 @@ def test_a_zero_at_the_start_hides_no_dependence():
     assert dae_jax.analyse(system, 0.0, jnp.zeros(2)).signature == ({0: 1, 1: 0}, {1: 0, 0: 0})
 
 
+@pytest.mark.parametrize("name", ["robertson", "akzo-nobel", "amplifier", "capacitor-loop", "car-axis", "jay"])
+def test_problems_have_their_published_index(name):
+    assert (of_scene(name).index, of_scene(name).regular) == (SCENES[name]().index, True)
+
+
+def implicit(residual):
+    return dae_jax.ImplicitDAE(lambda t, y, yd, args: residual(t, y, yd, args))
+
+
+def test_what_cancels_between_equations_is_taken_out():
+    """Two capacitors of the amplifier's: their currents leave one node and enter the other."""
+    found = of_scene("amplifier")
+    assert found.degrees_of_freedom == 5
+    names = [name for name, _ in found.hidden_constraints()]
+    assert names == [f"residual[{i}] + residual[{i + 1}]" for i in (0, 3, 6)]
+
+
+@pytest.mark.parametrize("capacitance", [lambda c, y: c, lambda c, y: c * (1 + jnp.exp(y[0]) ** 2)], ids=["c", "c(y)"])
+def test_what_cancels_may_be_a_parameter_or_depend_on_the_state(capacitance):
+    def residual(t, y, yd, args):
+        current = capacitance(args["c"], y) * (yd[0] - yd[1])
+        stamped = jnp.zeros(3).at[0].add(current).at[1].add(-current)
+        return stamped.at[0].add(args["g"] * y[0] - jnp.sin(t)).at[1].add(args["g"] * y[1]).at[2].set(yd[2] - y[1])
+
+    system, args = implicit(residual), {"c": 1.0, "g": 2.0}
+    found = dae_jax.analyse(system, 0.0, jnp.zeros(3), args)
+    assert (found.index, found.degrees_of_freedom, found.regular) == (1, 2, True)
+    # Traced, as in a solve.
+    while_tracing = []
+    look = lambda args: while_tracing.append(find_offsets(ResidualForm.of(system, 0.0, jnp.zeros(3), args), float))
+    jax.eval_shape(look, args)
+    assert while_tracing[0].combination == found.combination
+
+
+def test_what_cancels_with_a_derivative_of_another_equation():
+    """y₁' + y₂' is fixed by y₁ + y₂ = sin t: y₃ = a − cos t needs one derivative, its own derivative two."""
+    residual = lambda t, y, yd, a: jnp.stack([yd[0] + yd[1] + y[2] - t, y[0] + y[1] - jnp.sin(t), yd[2] + yd[0] - y[1]])
+    found = dae_jax.analyse(implicit(residual), 0.0, jnp.ones(3))
+    assert found.equations[0] == "residual[0] − d/dt residual[1]"
+    assert (found.index, found.degrees_of_freedom, found.regular) == (2, 1, True)
+
+
+def test_combinations_of_more_than_two_and_in_turns():
+    """Index by the matrices: A ẏ + B y has the index at which the pencil's nilpotent part vanishes."""
+    a = np.array([[1.0, 2, 3, 0], [0.1, 0.2, 0.3, 0.0], [4, 5, 6, 1], [5, 7, 9, 1]])
+    b = np.array([[1.0, 0, 2, 0], [0, 1, 0, 1], [1, 1, 0, 0], [0, 3, 1, 1]])
+    found = dae_jax.analyse(implicit(lambda t, y, yd, args: a @ yd + b @ y), 0.0, jnp.ones(4))
+    reduced = np.linalg.solve(a + 0.37 * b, a)
+    ranks = [np.linalg.matrix_rank(np.linalg.matrix_power(reduced, k), tol=1e-9) for k in range(4)]
+    assert found.regular
+    assert found.degrees_of_freedom == ranks[-1]
+    assert found.index == ranks.index(ranks[-1])
+
+
 def test_a_singular_jacobian_behind_a_regular_structure_is_found():
-    """The sums cancel: the difference of the equations has no derivative, so that the index is 1 and not 0."""
-    system = dae_jax.ImplicitDAE(lambda t, y, yd, a: jnp.stack([yd[0] + yd[1] + y[0], yd[0] + yd[1] + y[1]]))
-    found = dae_jax.analyse(system, 0.0, jnp.ones(2))
+    """The multiple is the state's: y₂ · first − y₁ · second has no derivative, so that the index is 1 and not 0."""
+    rate = lambda y, yd: yd[0] + jnp.cos(y[1]) * yd[1]
+    residual = lambda t, y, yd, a: jnp.stack([y[0] * rate(y, yd) + y[0], y[1] * rate(y, yd) + y[1] ** 2])
+    found = dae_jax.analyse(implicit(residual), 0.0, jnp.ones(2))
     assert not found.regular
     assert "Replace an equation by a combination" in str(found)
+
+
+def test_an_equation_given_twice_is_no_equation():
+    found = dae_jax.analyse(
+        implicit(lambda t, y, yd, a: jnp.stack([yd[0] + y[1], 2 * yd[0] + 2 * y[1]])), 0.0, jnp.ones(2)
+    )
+    assert not found.regular
 
 
 def test_redundant_constraints_are_singular():

@@ -12,7 +12,18 @@ import pytest
 PACKAGE = Path(__file__).parent.parent / "dae_jax"
 LAYERS = (
     {"kernels", "linalg", "progress", "structure"},
-    {"constraints", "initialise", "normals", "pencil", "reduced", "residual", "systems", "taylor", "underlying"},
+    {
+        "constraints",
+        "initialise",
+        "normals",
+        "offsets",
+        "pencil",
+        "reduced",
+        "residual",
+        "systems",
+        "taylor",
+        "underlying",
+    },
     {"formulations", "solvers"},
     {"analyse", "checks", "diagnostics", "explain", "jumps", "program", "solution", "solve", "tape"},
     {"baumgarte_loss", "compare", "maps", "plotting", "reductions", "scenes", "sweep", "sweep_store", "tune"},

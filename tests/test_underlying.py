@@ -153,6 +153,36 @@ def test_reactor_whose_temperature_is_prescribed():
     np.testing.assert_allclose(projected[:4], radau[:4], atol=1e-7)
 
 
+def test_an_amplifier_whose_capacitor_currents_cancel():
+    """Published: index 1, and the voltages after 0.2 s."""
+    scene = SCENES["amplifier"]()
+    off = np.array([0, 3, 3, 6, 3.1, 3, 6, 0.1])
+    start = dae_jax.consistent_state(scene.system, 0.0, off)
+    left = np.asarray(scene.system.residual(0.0, start, np.zeros(8), None))
+    np.testing.assert_allclose([left[0] + left[1], left[3] + left[4], left[6] + left[7]], 0, atol=1e-12)
+    assert np.abs(start - off).max() < 0.1
+    with pytest.raises(ValueError, match=r"residual\[3\] is off.*\n.*residual\[4\] is off"):
+        dae_jax.daesolve(scene.system, PROJECTED, 0.0, 0.2, None, off)
+    control = diffrax.PIDController(rtol=1e-8, atol=1e-8)
+    sol = dae_jax.daesolve(scene.system, PROJECTED, 0.0, 0.2, None, scene.y0, stepsize_controller=control)
+    np.testing.assert_allclose(sol.ys[-1], scene.reference(np.array([0.2]))[0], atol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["projection", "dummy derivatives", "baumgarte"])
+def test_an_equation_combined_with_the_derivative_of_another(name):
+    """y₃ = e^(−t) is hidden in y₁' + y₂' + y₃ = cos t + e^(−t) and y₁ + y₂ = sin t; y₁' + y₁ = sin t + e^(−t)."""
+    residual = lambda t, y, yd, a: jnp.stack(
+        [yd[0] + yd[1] + y[2] - jnp.cos(t) - jnp.exp(-t), y[0] + y[1] - jnp.sin(t), yd[2] + yd[0] - y[1]]
+    )
+    solver, formulation, _ = SOLVERS[name]
+    sol = dae_jax.daesolve(
+        dae_jax.ImplicitDAE(residual), solver, 0.0, 3.0, None, np.array([1.0, -1.0, 1.0]), formulation=formulation,
+        stepsize_controller=TIGHT,
+    )  # fmt: skip
+    first = 1.5 * np.exp(-3) + (np.sin(3) - np.cos(3)) / 2 + 3 * np.exp(-3)
+    np.testing.assert_allclose(sol.ys[-1], [first, np.sin(3) - first, np.exp(-3)], atol=1e-9)
+
+
 def test_order_five_with_fixed_steps():
     scene = SCENES["jay"]()
 

@@ -1,6 +1,6 @@
 """How small functions become fast machine code: scalar arithmetic and single kernels."""
 
-from .gathers import gathered as gathered
+from .gathers import gathered as gathered, windows as windows
 from .jaxprs import equations as equations, is_large as is_large
 from .numbers import on_numbers as on_numbers
 from .one_kernel import (
@@ -12,5 +12,6 @@ from .one_kernel import (
     one_kernel_enabled as one_kernel_enabled,
     without_checks as without_checks,
 )
+from .polynomials import Polynomial as Polynomial, polynomials as polynomials
 from .scalarise import scalarise as scalarise
 from .subroutine import subroutine as subroutine

@@ -1,4 +1,4 @@
-"""Which entries a gather reads, found without JAX: an operation on numbers would be compiled for each shape."""
+"""Which entries a gather reads and a scatter writes, found without JAX: an operation on numbers would be compiled for each shape."""
 
 from typing import Any
 
@@ -28,3 +28,24 @@ def gathered(
     found = found.reshape((*batch, *kept))
     window = range(len(batch), found.ndim)
     return np.moveaxis(found, tuple(window), numbers.offset_dims)
+
+
+def scattered(
+    places: Int[np.ndarray, "..."], indices: Int[np.ndarray, "..."], shape: tuple[int, ...], numbers: Any, mode: Any
+) -> Int[np.ndarray, "..."]:
+    """Where `jax.lax.scatter` puts each of the updates, which have this shape; −1: nowhere."""
+    return gathered(places, indices, *windows(places.shape, shape, numbers), mode)
+
+
+def windows(operand: tuple[int, ...], updates: tuple[int, ...], numbers: Any) -> tuple[Any, tuple[int, ...]]:
+    """The gather that reads what a scatter writes: its dimension numbers and slice sizes."""
+    sizes = iter([updates[axis] for axis in numbers.update_window_dims])
+    outside = {*numbers.inserted_window_dims, *numbers.operand_batching_dims}
+    inverse = jax.lax.GatherDimensionNumbers(
+        offset_dims=numbers.update_window_dims,
+        collapsed_slice_dims=numbers.inserted_window_dims,
+        start_index_map=numbers.scatter_dims_to_operand_dims,
+        operand_batching_dims=numbers.operand_batching_dims,
+        start_indices_batching_dims=numbers.scatter_indices_batching_dims,
+    )
+    return inverse, tuple(1 if axis in outside else next(sizes) for axis in range(len(operand)))

@@ -18,6 +18,7 @@ from .ordering import (
 from .pantelides import Pantelides as Pantelides, pantelides as pantelides
 from .sigma import (
     SigmaAnalysis as SigmaAnalysis,
+    highest_value_transversal as highest_value_transversal,
     jacobian_pattern as jacobian_pattern,
     sigma_method as sigma_method,
     variable_indices as variable_indices,

@@ -8,11 +8,10 @@ import itertools
 from collections.abc import Iterator
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..kernels import gathered
+from ..kernels import gathered, windows
 from .cells import Cells, as_sets, union, unless
 
 
@@ -42,16 +41,7 @@ def scatter(eqn: Any, inputs: list[Cells]) -> list[Cells]:
     """`operand.at[indices].set(updates)` and its relatives `add`, `multiply`, `min`, `max`."""
     operand, indices, updates = inputs
     numbers = eqn.params["dimension_numbers"]
-    window_sizes = iter([updates.shape[axis] for axis in numbers.update_window_dims])
-    outside = {*numbers.inserted_window_dims, *numbers.operand_batching_dims}
-    inverse = jax.lax.GatherDimensionNumbers(
-        offset_dims=numbers.update_window_dims,
-        collapsed_slice_dims=numbers.inserted_window_dims,
-        start_index_map=numbers.scatter_dims_to_operand_dims,
-        operand_batching_dims=numbers.operand_batching_dims,
-        start_indices_batching_dims=numbers.scatter_indices_batching_dims,
-    )
-    sizes = tuple(1 if axis in outside else next(window_sizes) for axis in range(len(operand.shape)))
+    inverse, sizes = windows(operand.shape, updates.shape, numbers)
     positions = list(_gathered(operand.shape, indices, inverse, sizes, eqn.params["mode"]))
     selector = _per_window(indices, numbers.update_window_dims, updates.shape)
     return [_write(operand, updates, positions, selector, SCATTERS[eqn.primitive.name])]

@@ -137,8 +137,14 @@ def jacobian_pattern(
     ]
 
 
-def variable_indices(signature: Sequence[Mapping[int, int]], found: SigmaAnalysis) -> tuple[int, ...]:
-    """The index of each variable: 1 + max cᵢ − dⱼ, over the equations i that determine it.
+def variable_indices(
+    pattern: Sequence[Sequence[int]],
+    transversal: Sequence[int],
+    equation_offsets: Sequence[int],
+    variable_offsets: Sequence[int],
+) -> tuple[int, ...]:
+    """The index of each variable, from the pattern of the system Jacobian: 1 + max cᵢ − dⱼ, over the equations i that
+    determine it. The greatest bounds the differential index.
 
     Those are the equations of its block of the system Jacobian's block triangular form, and of the blocks before on
     which they depend. A mechanism's q, v and λ have the indices 1, 2 and 3; a variable that a differential equation of
@@ -147,14 +153,12 @@ def variable_indices(signature: Sequence[Mapping[int, int]], found: SigmaAnalysi
     Source: E. Hairer, C. Lubich, M. Roche, *The Numerical Solution of Differential-Algebraic Systems by Runge–Kutta
     Methods*, section 1, for the notion; the formula follows from the offsets.
     """
-    pattern = jacobian_pattern(signature, found.equation_offsets, found.variable_offsets)
-    highest = [0] * len(signature)
-    indices = [0] * len(signature)
-    for block in block_triangular(pattern, found.transversal):
+    highest = [0] * len(pattern)
+    indices = [0] * len(pattern)
+    for block in block_triangular(pattern, transversal):
         before = {variable for equation in block.equations for variable in pattern[equation]} - set(block.variables)
-        offsets = [found.equation_offsets[equation] for equation in block.equations]
-        top = max([*offsets, *(highest[variable] for variable in before)])
+        top = max([*(equation_offsets[i] for i in block.equations), *(highest[variable] for variable in before)])
         for variable in block.variables:
             highest[variable] = top
-            indices[variable] = max(1 + top - found.variable_offsets[variable], 0)
+            indices[variable] = max(1 + top - variable_offsets[variable], 0)
     return tuple(indices)
