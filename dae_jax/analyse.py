@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .offsets import Combination, Offsets, find_offsets
+from .offsets import Combination, Offsets, Slopes, find_offsets
 from .residual import ResidualForm
 from .structure import Block, block_triangular, pantelides
 from .systems import System
@@ -163,23 +163,20 @@ def _differentiated(times: int) -> str:
 def _regular(form: ResidualForm, found: Offsets, t: Any, y: Any) -> bool:
     """Whether the system Jacobian has full rank at the state, for generic derivatives and multipliers."""
     rng = np.random.default_rng(0)
-    count = found.combination.degree + 1
-    wanted = np.zeros((count + 1, len(y), len(y)), bool)
-    for i, variables in enumerate(found.pattern):
-        for j in variables:
-            wanted[found.signature[i][j], i, j] = True
-
-    def combined(orders: Any) -> Any:
-        return found.combination.of(total_derivatives(form.residual, t, list(orders), count))[0]
-
+    slopes = Slopes(form, found, found.combination.degree, y.dtype)
+    along = jax.jit(slopes.along)
     for _ in range(3):
         at = y.at[form.layout.size :].set(rng.normal(size=form.extra))
-        orders = jnp.stack([at, *jnp.asarray(rng.normal(size=(count, len(y))), y.dtype)])
-        slopes = np.moveaxis(np.asarray(jax.jacfwd(combined)(orders)), 1, 0)
-        matrix = np.where(wanted, slopes, 0).sum(0)
+        values = np.asarray(along(t, jnp.stack([at, *jnp.asarray(rng.normal(size=slopes.shape), y.dtype)[1:]])))
+        matrix = np.zeros((len(y), len(y)))
+        for i, variables in enumerate(found.pattern):
+            for k, times, factor in found.combination.terms(i):
+                entries = slopes.by_entry(values, times, k)
+                for j in variables:
+                    matrix[i, j] += factor * entries.get((found.signature[i][j], j), 0)
         rows = np.abs(matrix).max(1, keepdims=True)
         if (rows > 0).all() and np.isfinite(matrix).all():
-            values = np.linalg.svd(matrix / rows, compute_uv=False)
-            if values[-1] > 100 * len(y) * np.finfo(matrix.dtype).eps * values[0]:
+            size = np.linalg.svd(matrix / rows, compute_uv=False)
+            if size[-1] > 100 * len(y) * jnp.finfo(y.dtype).eps * size[0]:
                 return True
     return False

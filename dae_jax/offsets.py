@@ -10,17 +10,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .kernels import polynomials
+from .kernels import Polynomial, polynomials
 from .structure import (
     SigmaAnalysis,
     StructurallySingular,
+    column_colouring,
     dependence,
     jacobian_pattern,
+    seed_matrix,
     sigma_method,
     signature,
     variable_indices,
 )
 from .taylor import total_derivatives
+
+
+_Polynomials = list[list[dict[tuple[int, int], Polynomial]]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,13 +124,13 @@ def find_offsets(form: Form, dtype: Any) -> Offsets:
         found = Offsets(by_y, by_rate, rows, sigma_method(rows))
     except StructurallySingular as singular:
         raise ValueError(_singular(form, singular)) from None
-    slopes = functools.cache(lambda degree: _slopes(form, degree, dtype))
+    slopes = functools.cache(lambda degree: Slopes(form, found, degree, dtype).as_polynomials())
     while form.may_cancel and (better := _combined(slopes, found)):
         found = better
     return found
 
 
-def _combined(slopes: Callable[[int], np.ndarray | None], before: Offsets) -> Offsets | None:
+def _combined(slopes: Callable[[int], _Polynomials | None], before: Offsets) -> Offsets | None:
     """With some of the equations replaced; `None` where nothing cancels."""
     c, d = before.sigma.equation_offsets, before.sigma.variable_offsets
     candidates = _may_cancel(before.pattern)
@@ -165,20 +170,43 @@ def _combined(slopes: Callable[[int], np.ndarray | None], before: Offsets) -> Of
     return after if after.sigma.degrees_of_freedom < before.sigma.degrees_of_freedom else None
 
 
-def _slopes(form: Form, degree: int, dtype: Any) -> np.ndarray | None:
-    """∂F/∂y^(k), of dF/dt and so on, as polynomials, by how often F is differentiated, equation, order k and variable."""
-    orders = jax.ShapeDtypeStruct((degree + 2, form.size), dtype)
-    levels = lambda t, orders: jnp.stack(total_derivatives(form.residual, t, list(orders), degree + 1))
-    return polynomials(jax.jacfwd(levels, 1), jax.ShapeDtypeStruct((), dtype), orders)
+class Slopes:
+    """∂F/∂y^(k), of dF/dt and so on up to a `degree`, along as few directions as tell them apart."""
+
+    def __init__(self, form: Form, found: Offsets, degree: int, dtype: Any) -> None:
+        # A derivative of an equation has no variables but those of the equation.
+        self.pattern = found.by_y | found.by_rate
+        self.colours = column_colouring(self.pattern)
+        self.form, self.degree, self.dtype = form, degree, dtype
+        self.shape = (degree + 2, form.size)
+
+    def along(self, t: Any, orders: Float[Array, "orders n"]) -> Float[Array, "directions degree+1 n"]:
+        """The directional derivatives at t and (y, ẏ, …)."""
+        levels = lambda orders: jnp.stack(total_derivatives(self.form.residual, t, list(orders), self.degree + 1))
+        directions = np.kron(np.eye(self.shape[0]), seed_matrix(self.colours).T).reshape(-1, *self.shape)
+        return jax.vmap(lambda v: jax.jvp(levels, (orders,), (v,))[1])(jnp.asarray(directions, self.dtype))
+
+    def by_entry(self, found: np.ndarray, k: int, i: int) -> dict[tuple[int, int], Any]:
+        """Of the k-th derivative of equation i, by order and variable, from what `along` gives."""
+        found = found.reshape(self.shape[0], -1, *found.shape[1:])
+        places = np.flatnonzero(self.pattern[i])
+        return {(m, int(j)): found[m, self.colours[j], k, i] for m in range(self.shape[0]) for j in places}
+
+    def as_polynomials(self) -> _Polynomials | None:
+        """For each derivative and each equation, by order and variable; `None` where they have no such form."""
+        found = polynomials(self.along, *(jax.ShapeDtypeStruct(shape, self.dtype) for shape in ((), self.shape)))
+        if found is None:
+            return None
+        return [[self.by_entry(found, k, i) for i in range(self.form.size)] for k in range(self.degree + 1)]
 
 
-def _summed(terms: Sequence[tuple[int, int, float]], slopes: np.ndarray) -> dict[tuple[int, int, Any], float]:
+def _summed(terms: Sequence[tuple[int, int, float]], slopes: _Polynomials) -> dict[tuple[int, int, Any], float]:
     """The slopes of a combination: coefficients that are not 0, by order, variable and monomial."""
     value: dict[tuple[int, int, Any], float] = {}
     size: dict[tuple[int, int, Any], float] = {}
     for i, k, factor in terms:
-        for order, j in np.ndindex(slopes.shape[2:]):
-            for monomial, a in slopes[k, i, order, j].items():
+        for (order, j), entry in slopes[k][i].items():
+            for monomial, a in entry.items():
                 at = (order, j, monomial)
                 value[at] = value.get(at, 0.0) + factor * a
                 size[at] = size.get(at, 0.0) + abs(factor * a)

@@ -133,6 +133,18 @@ def test_combinations_of_more_than_two_and_in_turns():
     assert found.index == ranks.index(ranks[-1])
 
 
+def test_a_circuit_of_200_nodes():
+    """A capacitor joins each second node to the next, a resistor the others."""
+
+    def residual(t, y, yd, args):
+        current = yd[::2] - yd[1::2]
+        stamped = jnp.zeros(200).at[::2].add(current).at[1::2].add(-current)
+        return stamped + y + jnp.concatenate([y[:1] - jnp.sin(t), y[1:] - y[:-1]])
+
+    found = dae_jax.analyse(implicit(residual), 0.0, jnp.zeros(200))
+    assert (found.index, found.degrees_of_freedom, found.regular) == (1, 100, True)
+
+
 def test_a_singular_jacobian_behind_a_regular_structure_is_found():
     """The multiple is the state's: y₂ · first − y₁ · second has no derivative, so that the index is 1 and not 0."""
     rate = lambda y, yd: yd[0] + jnp.cos(y[1]) * yd[1]
