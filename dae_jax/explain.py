@@ -11,13 +11,15 @@ import numpy as np
 
 from .checks import refuse_bad_start
 from .constraints import MechanicalODE
-from .formulations import AbstractFormulation, Residual
+from .formulations import AbstractFormulation, DummyDerivatives, Residual
 from .kernels import equations, hindrances, one_kernel_enabled, without_checks
 from .linalg.semidefinite import LOOPED, UNROLLED
 from .normals import SparseNormals
 from .pencil import Pencil
 from .program import Solve
+from .residual import ResidualForm
 from .solve import prepared
+from .systems import ConstrainedSystem
 from .underlying import StructuralODE
 
 
@@ -172,8 +174,9 @@ def explain(
     if isinstance(solve.formulation, Residual):
         y, pencil = solve.formulation.encode(system, t0, y0, args)
         return _of_residual(pencil, t0, y, method, enabled and not found, found)
-    y, ode = solve.formulation.encode(system, t0, y0, args, rank)
-    if isinstance(ode, StructuralODE):
+    if isinstance(solve.formulation, DummyDerivatives) or not isinstance(system, ConstrainedSystem):
+        ode = StructuralODE.of(ResidualForm.of(system, t0, y0, args), t0.dtype)
+        y = jax.eval_shape(ode.encode, t0, y0)
         return StructuralPlan(
             method=method,
             linear_solver=ode.tearing.describe(ode.form.size),

@@ -24,7 +24,8 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
     step_rejected = (
         "The step size went to the resolution of time: at the last time reached the force is not finite, or the "
-        "constraints become dependent there (a singular configuration)."
+        "constraints become dependent there (a singular configuration), or the equations do not determine all "
+        "derivatives (`dae_jax.analyse` says so)."
     )
     off_manifold = (
         "The nonlinear equations of a step had no solution within reach: the step is too large for the manifold's "

@@ -81,6 +81,8 @@ def minimal(
         rows = [embed(t, z) for t, z in zip(points, found.y.T, strict=True)]
         at = np.searchsorted(points, times)
         q, v = (np.stack(x)[at] for x in zip(*rows, strict=True))
+        for shared in (q, v):
+            shared.setflags(write=False)
         return q, v
 
     return lambda times: solved(np.atleast_1d(np.asarray(times, float)).tobytes())
