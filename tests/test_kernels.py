@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import dae_jax
-from dae_jax.kernels import configure, hindrances, one_kernel, polynomials, scalarise
+from dae_jax.kernels import configure, hindrances, one_kernel, polynomials, scalarise, subroutine
 
 
 def length(x):
@@ -356,3 +356,12 @@ def test_printing_from_a_users_function_prevents_one_kernel(capfd):
     jax.effects_barrier()
     assert np.isfinite(sol.ys[0]).all()
     assert "t = " in capfd.readouterr().out
+
+
+@pytest.mark.parametrize("function", [jnp.sin, lambda x: jnp.where(x > 1, 0.5 * x, x)])
+def test_what_xla_would_share_among_threads_is_in_a_kernel_all_the_same(function):
+    """A function of half a megabyte, in a loop of a length that is not known."""
+    halved = subroutine(function)
+    loop = lambda x, n: jax.lax.while_loop(lambda c: c[0] < n, lambda c: (c[0] + 1, halved(c[1])), (0, x))[1]
+    x = jnp.linspace(0.0, 3.0, 100_000)
+    close(jax.jit(one_kernel(loop, "reverse"))(x, 3), loop(x, 3))

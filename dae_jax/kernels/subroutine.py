@@ -1,10 +1,12 @@
 """Small functions as subroutines of the compiled program."""
 
+import contextlib
 import functools
 from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
 
 
@@ -14,13 +16,19 @@ def subroutine(fn: Callable[..., Any], **jit_options: Any) -> Callable[..., Any]
     Inlined, XLA would fuse what produces an argument into each of its uses: the linear combination of a Runge–Kutta
     stage was computed three times over (double pendulum, DOP853: 280 ns a step against 230).
     """
-    call = jax.jit(fn, **jit_options)
+
+    def body(*args: Any) -> Any:
+        # What fn calls is inlined; XLA would share out the last operation of a function with a single result among
+        # threads if that is large, which cannot be done inside a kernel.
+        with set_xla_metadata(inlineable=None, xla_cpu_small_call=None):
+            return fn(*args), jnp.zeros(())
+
+    call = jax.jit(body, **jit_options)
 
     @functools.wraps(fn)
     def called(*args: Any) -> Any:
-        if jax.default_backend() != "cpu":
-            return call(*args)
-        with set_xla_metadata(inlineable="false"):
-            return call(*args)
+        on_cpu = jax.default_backend() == "cpu"
+        with set_xla_metadata(inlineable="false") if on_cpu else contextlib.nullcontext():
+            return call(*args)[0]
 
     return called
