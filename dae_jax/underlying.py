@@ -17,6 +17,7 @@ from .linalg import (
     fixed_point,
     implicit_root,
     relative_change,
+    row_products,
     semidefinite_solve,
     solve,
     take,
@@ -203,8 +204,8 @@ class StructuralODE(ManifoldODE):
     @property
     def invariant_names(self) -> tuple[str, ...]:
         """A name for each invariant."""
-        levels = range(max(self.orders.equations))
-        return tuple(derivative_of(self.equations[i], k) for k in levels for i in self.orders.rows(k))
+        names = self.equations
+        return tuple(derivative_of(names[i], k) for k in range(max(self.orders.equations)) for i in self.orders.rows(k))
 
     def violations(self, t: Any, y: Any) -> Float[Array, " m"]:
         """H(t, Y), all levels."""
@@ -218,7 +219,7 @@ class StructuralODE(ManifoldODE):
     def tangent(self, dy: Any, normals: Float[Array, "m N"]) -> Any:
         if not len(normals):
             return dy
-        gram = jnp.sum(normals[:, None] * normals, -1)
+        gram = row_products(normals, normals)
         return dy - self.shift(0, normals, semidefinite_solve(gram, jnp.sum(normals * dy, 1)))
 
     def shift(self, y: Any, normals: Any, mu: Float[Array, " m"]) -> Any:
@@ -233,7 +234,7 @@ class StructuralODE(ManifoldODE):
 
             def correct(mu: Any) -> tuple[Any, Any]:
                 here = ode.shift(y, normals, mu)
-                matrix = jnp.sum(ode.normals(t, here)[:, None] * normals, -1)
+                matrix = row_products(ode.normals(t, here), normals)
                 delta = solve(matrix, ode.violations(t, here))
                 return mu - delta, relative_change(ode.shift(0, normals, delta), here)
 
@@ -314,7 +315,7 @@ def _nearest(ode: StructuralODE, t: Any, known: Any, weights: Any) -> Any:
         largest = jnp.max(jnp.abs(a * weights), 1)
         scale = 1 / jnp.where(largest > 0, largest, 1)
         a, off = a * scale[:, None], scale * (h + jnp.sum(a * (start - y), 1))
-        gram = jnp.sum((a * weights)[:, None] * (a * weights), -1)
+        gram = row_products(a * weights, a * weights)
         # What the free entries cannot mend stays as it is, in place of growing without bound.
         cut = 100 * jnp.finfo(y.dtype).eps * jnp.maximum(jnp.trace(gram), 1)
         return start - weights**2 * jnp.sum(a * solve(gram + cut * jnp.eye(len(h), dtype=y.dtype), off)[:, None], 0)

@@ -143,14 +143,16 @@ class EntryByEntry:
         shape = eqn.outvars[0].aval.shape
         operands = [np.broadcast_to(a, shape).ravel() for a in args]
         size = operands[0].size if operands else 0
+        if all(is_number(x) for operand in operands for x in operand):
+            numbers = on_numbers(
+                eqn, [np.array(list(operand), v.aval.dtype) for operand, v in zip(operands, eqn.invars, strict=True)]
+            )
+            if numbers is not None:
+                return objects(list(numbers), shape)
         return objects([self.scalar(eqn, [o[i] for o in operands]) for i in range(size)], shape)
 
     def scalar(self, eqn: Any, x: list[Any]) -> Any:
         name = eqn.primitive.name
-        if all(map(is_number, x)) and eqn.outvars[0].aval.dtype in (bool, np.float64, np.float32):
-            number = on_numbers(eqn, x)
-            if number is not None:
-                return number[()]
         match name:
             case "mul":
                 return self.product(*x)

@@ -37,6 +37,8 @@ def scalarise(fn: Callable[..., Any], limit: int = LIMIT) -> Callable[..., Any]:
     @functools.wraps(fn)
     def scalarised(*args: Any) -> Any:
         leaves, treedef = jax.tree.flatten(args)
+        if sum(map(np.size, leaves)) > limit:
+            return fn(*args)
 
         def flat(*flat_leaves: Any) -> Any:
             return fn(*jax.tree.unflatten(treedef, flat_leaves))

@@ -27,6 +27,13 @@ def solve(a: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:
     return lax.custom_linear_solve(lambda x: jnp.sum(a * x, 1), b, solve=eliminated(a), transpose_solve=eliminated(a.T))
 
 
+def row_products(a: Float[Array, "m n"], b: Float[Array, "k n"]) -> Float[Array, "m k"]:
+    """A Bᵀ, in plain arithmetic up to the size of the largest system that is solved so."""
+    if len(a) * b.size > LOOPED**3:
+        return jnp.dot(a, b.T, precision=lax.Precision.HIGHEST)
+    return jnp.sum(a[:, None] * b, -1)
+
+
 def _gauss_jordan(a: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:
     n = a.shape[0]
     rows = jnp.arange(n)
