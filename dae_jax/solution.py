@@ -23,8 +23,8 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "the method."
     )
     step_rejected = (
-        "The step size went to the resolution of time: at the last time reached the force is not finite, or the "
-        "constraints become dependent there (a singular configuration), or the equations do not determine all "
+        "The step size went to the resolution of time: at the last time reached the force is not finite, the "
+        "constraints become dependent (a singular configuration) or jump, or the equations do not determine all "
         "derivatives (`dae_jax.analyse` says so)."
     )
     off_manifold = (

@@ -12,10 +12,12 @@ from jaxtyping import Array, Bool, Float, Int
 from ..linalg import implicit_root, rms_norm
 from .manifold import clock
 from .residual_steps import (
+    FULL,
     AbstractResidualSolver,
     Tolerances,
     at_the_floor,
     constant,
+    is_smallest,
     not_begun,
     of_step,
     simplified_newton,
@@ -155,7 +157,7 @@ class BDF(AbstractResidualSolver):
         y1, (newton, factors, pivot) = implicit_root(
             lambda y, params: params[0].residual(y),
             lambda params: _solve(*params),
-            (_Step(args, sign, t1, h, method.c, y, rate), *constant((y0, state)), tol),
+            (_Step(args, sign, t1, h, method.c, y, rate), *constant((y0, state, is_smallest(t0, t1))), tol),
             linear_solve=lambda inverse, b: inverse(b),
             jacobian=lambda y, params: functools.partial(params[0].pencil.solve, params[0].factor(y)[0]),
         )
@@ -171,6 +173,10 @@ class BDF(AbstractResidualSolver):
         higher = size(change - _at(star, k + 1))
         alike = jnp.where(method.constant & (k == state.used), state.alike, 0) + 1
         decision = _decision(constant(method), state, alike, size(change), sizes, higher)
+        # What is algebraic may jump, and the history with it.
+        smooth = method.tail * size(change * args.outline.differential) < 1
+        jumped = constant(is_smallest(t0, t1) & newton.converged & (decision.error >= 1) & smooth)
+        decision = decision._replace(error=jnp.where(jumped, (2 / SAFETY) ** -ERROR_ORDER, decision.error))
         error = jnp.where(newton.converged, decision.error, jnp.inf) * tol.scale(y0, y1)
         failure = of_step(newton.converged, pivot, y0.size, decision.error)
         y1, error, result = at_the_floor(failure, t0, t1, y0, y1, constant(error))
@@ -179,6 +185,7 @@ class BDF(AbstractResidualSolver):
             phi[1:], method.psi, state.steps + 1, decision.order, k, alike, decision.rising,
             *constant((factors, method.c, newton.eta)),
         )  # fmt: skip
+        new = jax.tree.map(lambda a, b: jnp.where(jumped, a, b), _start(jnp.zeros_like(y1), new.factors), new)
         used = jnp.stack([jnp.where(j <= k, 1, 0) for j in ROWS])[:, None]
         return y1, error, {"phi": jnp.where(used, phi, 0), "psi": method.psi}, new, result
 
@@ -230,22 +237,26 @@ def _at(rows: list[Any], k: Any) -> Any:
     return sum(jnp.where(j == k, row, 0) for j, row in enumerate(rows))
 
 
-def _solve(step: _Step, y0: Any, state: _State, tol: Tolerances) -> Any:
-    """y at t₁, and how it was found: with the factors at hand first, with new ones where these fail."""
+def _solve(step: _Step, y0: Any, state: _State, smallest: Any, tol: Tolerances) -> Any:
+    """y at t₁, and how it was found: with the factors at hand first, with new ones where these fail, and in the smallest
+    step with new ones for each correction.
+    """
     scale = step.pencil.weights(step.h) / tol.scale(y0)
     changed = jnp.abs(step.c - state.c) > ALIKE * step.c
 
     def attempt(carry: Any) -> Any:
-        tries, fresh, _, factors, _ = carry
+        tries, fresh, before, factors, _ = carry
         renew = (tries > 0) | changed
-        factors, pivot = lax.cond(renew, lambda: step.factor(step.y), lambda: (factors, jnp.full_like(step.c, jnp.inf)))
+        start = jnp.where(tries > 2, before.x, step.y)
+        factors, pivot = lax.cond(renew, lambda: step.factor(start), lambda: (factors, jnp.full_like(step.c, jnp.inf)))
         correction = lambda y: -step.pencil.solve(factors, step.residual(y))
-        newton = simplified_newton(correction, step.y, scale, jnp.where(renew, 1, state.eta), tol)
+        most = jnp.where(tries > 1, 1, tol.corrections)
+        newton = simplified_newton(correction, start, scale, jnp.where(renew, 1, state.eta), tol, most)
         return tries + 1, fresh | renew, newton, factors, pivot
 
     def again(carry: Any) -> Any:
         tries, fresh, newton, *_ = carry
-        return (tries == 0) | (~newton.converged & ~fresh)
+        return (tries == 0) | ~newton.converged & (~fresh | smallest & (tries < FULL))
 
     first = (0, jnp.asarray(False), not_begun(step.y, state.eta), state.factors, jnp.zeros_like(step.h))
     _, fresh, newton, factors, pivot = lax.while_loop(again, attempt, first)

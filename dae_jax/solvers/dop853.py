@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from . import dop853_coefficients as coefficients
-from .explicit import Flat, combine, first_derivative, identity, increments
+from .explicit import Flat, combine, first_derivative, identity, increments, with_landing
 
 
 STAGES = 12
@@ -74,10 +74,12 @@ class DOP853(diffrax.AbstractAdaptiveSolver):
         increment = lambda t, y: h * flat.field(t, y)
         k0 = h * first_derivative(flat, t0, state, made_jump)
         ks = increments(_ROWS[: STAGES - 1], coefficients.C[1:STAGES], increment, t0, t1, flat.y0, k0, flat.looped)
-        y1, found = flat.land(t1, combine(coefficients.B, ks, flat.y0))
+        ahead = combine(coefficients.B, ks, flat.y0)
+        y1, found = flat.land(t1, ahead)
         f1 = flat.field(t1, y1)
         ks.append(h * f1)
         error = _error(combine(coefficients.E5, ks), combine(coefficients.E3, ks), flat.y0, y1)
+        error = with_landing(error, ahead, y1)
         rest = self._interpolant(increment, t0, t1, flat.y0, y1, ks) if self.dense else [y1 - flat.y0]
         dense = {"y0": y0, "f": jax.tree.map(lambda *f: jnp.stack(f), *map(flat.tree, rest))}
         return flat.tree(y1), flat.tree(error), dense, flat.tree(f1), found

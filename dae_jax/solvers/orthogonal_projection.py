@@ -3,9 +3,10 @@
 from typing import Any
 
 import diffrax
+import jax
 import jax.numpy as jnp
 
-from .explicit import unrolled
+from .explicit import unrolled, with_landing
 from .manifold import AbstractManifoldSolver, clock, or_nan, outcome
 
 
@@ -74,8 +75,9 @@ class OrthogonalProjection(diffrax.AbstractWrappedSolver, AbstractManifoldSolver
             y1, error, dense, state, found = solver.landing_step(terms, t0, t1, y0, args, solver_state, made_jump, land)
             result = diffrax.RESULTS.successful
         else:
-            y1, error, dense, state, result = solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
-            y1, found = land(t1, y1)
+            ahead, error, dense, state, result = solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
+            y1, found = land(t1, ahead)
+            error = None if error is None else jax.tree.map(with_landing, error, ahead, y1)
         error = None if error is None else or_nan(found, error)
         result = diffrax.RESULTS.where(result == diffrax.RESULTS.successful, outcome(jnp.asarray(found)), result)
         return or_nan(found, y1), error, dense, state, result

@@ -14,10 +14,12 @@ from ..linalg import implicit_root
 from .manifold import clock
 from .radau_coefficients import ALPHA, BACK, BETA, ERROR, GAMMA, INVERSE, NODES, POLYNOMIAL, TRANSFORM
 from .residual_steps import (
+    FULL,
     AbstractResidualSolver,
     Tolerances,
     at_the_floor,
     constant,
+    is_smallest,
     not_begun,
     of_step,
     simplified_newton,
@@ -176,10 +178,10 @@ class RadauIIA5(AbstractResidualSolver):
         tol = tolerances(self.rtol, self.atol, y0.dtype)
         # The unknowns of a stage are interleaved, so that a band stays one.
         apart = lambda z: z.reshape(-1, 3).T
-        flat, (newton, jacobians, factors, pivot) = implicit_root(
+        flat, (newton, jumped, jacobians, factors, pivot) = implicit_root(
             lambda z, params: jnp.stack(params[0].residuals(apart(z)), 1).reshape(-1),
             lambda params: _solve(*params),
-            (step, constant(state), tol),
+            (step, *constant((state, is_smallest(t0, t1))), tol),
             linear_solve=_linear_solve,
             jacobian=lambda z, params: _coupled(params[0], apart(z)),
         )
@@ -191,7 +193,8 @@ class RadauIIA5(AbstractResidualSolver):
         y1, scaled, result = at_the_floor(failure, t0, t1, y0, y1, scaled)
         rates = _combined(INVERSE, z)[2] * (step.sign / step.h)
         slow = (newton.theta > FAST) & (newton.count > 1)
-        new = _State(z, step.h, rates, jacobians, factors, step.h, slow, newton.eta)
+        # What jumped says nothing of the next step.
+        new = _State(z, jnp.where(jumped, 0, step.h), rates, jacobians, factors, step.h, slow, newton.eta)
         return y1, scaled, {"y0": y0, "z": z}, constant(new), result
 
 
@@ -202,37 +205,36 @@ def _predicted(state: _State, h: Any) -> Float[Array, "3 n"]:
     return jnp.where(state.h == 0, 0, ahead)
 
 
-def _solve(step: _Step, state: _State, tol: Tolerances) -> Any:
-    """The stages, and how they were found: with the Jacobians at hand first, with new ones where these fail."""
-    h, start = step.h, _predicted(state, step.h)
+def _solve(step: _Step, state: _State, smallest: Any, tol: Tolerances) -> Any:
+    """The stages, and how they were found: with the Jacobian at hand first, with new ones where these fail, and in the
+    smallest step with new ones for each correction.
+    """
+    h, predicted = step.h, _predicted(state, step.h)
     scale = step.pencil.weights(h) / tol.scale(step.y0)
 
     def attempt(carry: Any) -> Any:
-        tries, fresh, _, jacobians, factors, _ = carry
-        renew = (tries > 0) | state.refresh
-        evaluate = lambda: step.jacobians(step.sign * step.t0, step.y0, state.rates)
+        tries, fresh, before, jacobians, factors, _ = carry
+        renew, full = (tries > 0) | state.refresh, tries > 2
+        start = jnp.where(full, before.x, predicted)
+        t, y = jnp.where(full, step.t1, step.t0), jnp.where(full, step.y0 + before.x[2], step.y0)
+        evaluate = lambda: step.jacobians(step.sign * t, y, state.rates)
         jacobians = lax.cond(renew, evaluate, lambda: jacobians)
         infinite = jnp.full_like(h, jnp.inf)
         factors, pivot = lax.cond(
             renew | (h != state.factored), lambda: step.factor(jacobians), lambda: (factors, infinite)
         )
-        return (
-            tries + 1,
-            fresh | renew,
-            simplified_newton(lambda z: step.correction(factors, z), start, scale, state.eta, tol),
-            jacobians,
-            factors,
-            pivot,
-        )
+        most = jnp.where(tries > 1, 1, tol.corrections)
+        newton = simplified_newton(lambda z: step.correction(factors, z), start, scale, state.eta, tol, most)
+        return tries + 1, fresh | renew, newton, jacobians, factors, pivot
 
     def again(carry: Any) -> Any:
         tries, fresh, newton, *_ = carry
-        return (tries == 0) | (~newton.converged & ~fresh)
+        return (tries == 0) | ~newton.converged & (~fresh | smallest & (tries < FULL))
 
-    none = not_begun(start, state.eta)
+    none = not_begun(predicted, state.eta)
     first = (0, jnp.asarray(False), none, state.jacobians, state.factors, h)
-    _, _, newton, jacobians, factors, pivot = lax.while_loop(again, attempt, first)
-    return newton.x.T.reshape(-1), (newton._replace(x=None), jacobians, factors, pivot)
+    tries, _, newton, jacobians, factors, pivot = lax.while_loop(again, attempt, first)
+    return newton.x.T.reshape(-1), (newton._replace(x=None), tries > 2, jacobians, factors, pivot)
 
 
 def _error(step: _Step, factor: Any, z: Any, tol: Tolerances) -> Float[Array, " n"]:

@@ -9,13 +9,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..linalg import rms_norm, roundoff
 
 
 # The part of the tolerance that round-off may use up (BCP, section 5.2.2).
 NOISE = 0.33
+# Where algebraic variables jump, Newton's method with a Jacobian of its own for each of its corrections.
+FULL = 30
 
 
 class AbstractResidualSolver(diffrax.AbstractAdaptiveSolver):
@@ -101,7 +103,9 @@ def not_begun(start: Any, eta: Any) -> Newton:
     return Newton(start, 0, zero, eta, zero, no, no)
 
 
-def simplified_newton(correction: Callable[[Any], Any], start: Any, scale: Any, eta: Any, tol: Tolerances) -> Newton:
+def simplified_newton(
+    correction: Callable[[Any], Any], start: Any, scale: Any, eta: Any, tol: Tolerances, corrections: Any
+) -> Newton:
     """Corrects `start` until what remains, η ‖Δx‖, is small beside the tolerance; ‖Δx‖ is that of Δx · `scale`.
 
     Source: E. Hairer, G. Wanner, *Solving Ordinary Differential Equations II*, section IV.8.
@@ -109,7 +113,7 @@ def simplified_newton(correction: Callable[[Any], Any], start: Any, scale: Any, 
     epsilon = jnp.finfo(start.dtype).eps
 
     def goes_on(s: Newton) -> Any:
-        return ~s.converged & ~s.diverged & (s.count < tol.corrections)
+        return ~s.converged & ~s.diverged & (s.count < corrections)
 
     def correct(s: Newton) -> Newton:
         dx = correction(s.x)
@@ -117,7 +121,7 @@ def simplified_newton(correction: Callable[[Any], Any], start: Any, scale: Any, 
         theta = size / jnp.maximum(s.last, jnp.finfo(start.dtype).tiny)
         first = s.count == 0
         eta = jnp.where(first, jnp.maximum(s.eta, epsilon) ** 0.8, theta / jnp.maximum(1 - theta, epsilon))
-        remaining = tol.corrections - 1 - s.count
+        remaining = corrections - 1 - s.count
         stagnant = ~first & (theta >= 1)
         hopeless = stagnant | (eta * size * theta**remaining > tol.newton) & (size > NOISE)
         # A correction that does not shrink any more but is small is round-off.
@@ -144,13 +148,17 @@ def of_step(found: Any, pivot: Any, size: int, error: Any) -> Failure:
     return Failure(found, ~(pivot > size * roundoff(pivot.dtype)), error < 1)
 
 
+def is_smallest(t0: Any, t1: Any) -> Bool[Array, ""]:
+    """Whether time resolves no smaller step."""
+    resolution = 16 * jnp.finfo(t0.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+    return t1 - t0 <= jnp.maximum(resolution, jnp.finfo(t0.dtype).tiny ** 0.75)
+
+
 def at_the_floor(failure: Failure, t0: Any, t1: Any, y0: Any, y1: Any, error: Any) -> tuple[Any, Any, diffrax.RESULTS]:
     """(y₁, error, result) of a step. One that came to nothing has an infinite error, so that a smaller one is tried; where
     time resolves no smaller one, the error is 0, y₁ = y₀, and the result tells an adaptive solve why it ends here.
     """
-    codes = diffrax.RESULTS
-    resolution = 16 * jnp.finfo(t0.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
-    smallest = t1 - t0 <= jnp.maximum(resolution, jnp.finfo(t0.dtype).tiny ** 0.75)
+    codes, smallest = diffrax.RESULTS, is_smallest(t0, t1)
     result = codes.where(failure.singular, codes.singular, codes.nonlinear_divergence)
     result = codes.where(failure.found, codes.successful, result)
     result = codes.where(failure.found & ~failure.accurate & smallest, codes.dt_min_reached, result)

@@ -6,9 +6,14 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 
 from .explicit import Unrolled, unrolled
 from .manifold import AbstractManifoldSolver, clock, or_nan, outcome
+
+
+# A step may be this much longer than the time times the speed at its two ends.
+SPEEDS = 10
 
 
 class TangentPoint(eqx.Module):
@@ -96,10 +101,12 @@ class TangentSpace(AbstractManifoldSolver, diffrax.AbstractAdaptiveSolver):
         wrapped = _Controlled(tangent_term, terms)
         u1, error, dense, _, _ = solver.landing_step(wrapped, t0, t1, y0, None, first, False, lambda t, u: (u, True))
         y1, found = args.restore(sign * t1, u1, chart)
-        error = None if error is None else or_nan(found, error)
         y1 = or_nan(found, y1)
+        end = terms.vf(t1, y1, args)
+        if error is not None:
+            error = or_nan(found & ~_jumps(y0, y1, derivative, end, terms.contr(t0, t1)), error)
         info = {"inner_info": dense, "normals": chart}
-        return y1, error, info, terms.vf(t1, y1, args), outcome(found)
+        return y1, error, info, end, outcome(found)
 
     def land(self, t: Any, y: Any, ode: Any) -> Any:
         if not isinstance(y, TangentPoint):
@@ -120,6 +127,16 @@ class _Controlled(eqx.Module):
 
     def contr(self, t0: Any, t1: Any) -> Any:
         return self.outer.contr(t0, t1)
+
+
+def _jumps(y0: Any, y1: Any, start: Any, end: Any, h: Any) -> Any:
+    """Whether a step is much longer than the speed at its ends explains: where the manifold jumps in time, the point of the
+    chart is lifted on to it all the same.
+    """
+    y0, y1, start, end = (ravel_pytree(x)[0] for x in (y0, y1, start, end))
+    largest = lambda x: jnp.max(jnp.abs(x))
+    allowed = float(jnp.finfo(y0.dtype).eps) ** 0.5 * (1 + largest(y1))
+    return largest(y1 - y0) > allowed + SPEEDS * jnp.abs(h) * (largest(start) + largest(end))
 
 
 def _field(terms: Any, sign: Any, ode: Any, chart: Any, t: Any, u: Any) -> Any:

@@ -1,0 +1,56 @@
+"""Sources that jump: solvers of residuals pass, with the algebraic variables; those that differentiate the jump say so."""
+
+import diffrax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dae_jax
+
+
+CONTROL = diffrax.PIDController(rtol=1e-8, atol=1e-8)
+SWITCHED, LEVEL = 1 / 3, 3.0
+
+
+def residual(t, y, yd, level):
+    """A capacitor behind a nonlinear resistor on a source that is switched on: z + w = level, z = 2 w³ + w."""
+    x, z, w = y
+    source = jnp.where(t < SWITCHED, 0.0, level)
+    return jnp.stack([yd[0] + x - z, z + w - source, z - 2 * w**3 - w])
+
+
+def exact(t):
+    w = next(root.real for root in np.roots([2, 0, 2, -LEVEL]) if abs(root.imag) < 1e-12)
+    z = LEVEL - w
+    return np.array([z * (1 - np.exp(SWITCHED - t)), z, w])
+
+
+@pytest.mark.parametrize("solver", [dae_jax.RadauIIA5(), dae_jax.BDF()], ids=["radau", "bdf"])
+def test_algebraic_variables_jump_with_their_source(solver):
+    sol = dae_jax.daesolve(
+        dae_jax.ImplicitDAE(residual), solver, 0.0, 2.0, None, np.zeros(3), LEVEL, stepsize_controller=CONTROL,
+        saveat=diffrax.SaveAt(ts=[0.2, SWITCHED + 1e-6, 1.0, 2.0]),
+    )  # fmt: skip
+    np.testing.assert_allclose(sol.ys[0], 0, atol=1e-12)
+    for t, y in zip(sol.ts[1:], sol.ys[1:], strict=True):
+        np.testing.assert_allclose(y, exact(float(t)), atol=2e-7)
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [dae_jax.OrthogonalProjection(diffrax.Tsit5()), dae_jax.TangentSpace(dae_jax.DOP853())],
+    ids=["projection", "tangent"],
+)
+def test_a_manifold_that_jumps_is_an_error(solver):
+    with pytest.raises(RuntimeError, match=r"become dependent .* or jump.*t = 0\.333"):
+        dae_jax.daesolve(
+            dae_jax.ImplicitDAE(residual), solver, 0.0, 2.0, None, np.zeros(3), LEVEL, stepsize_controller=CONTROL
+        )
+
+
+def test_a_differential_variable_does_not_jump():
+    """x' = 1/(1 − t): the step is smallest where x is infinite, and nothing is passed over."""
+    system = dae_jax.ImplicitDAE(lambda t, y, yd, a: jnp.stack([yd[0] * (1 - t) - 1, y[1] - y[0]]))
+    for solver in (dae_jax.RadauIIA5(), dae_jax.BDF()):
+        with pytest.raises(RuntimeError):
+            dae_jax.daesolve(system, solver, 0.0, 2.0, None, np.zeros(2), stepsize_controller=CONTROL, max_steps=10_000)
