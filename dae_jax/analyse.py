@@ -1,6 +1,7 @@
 """Structural analysis: the index of a system, its hidden constraints and its degrees of freedom, before it is solved."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .offsets import Combination, Offsets, Slopes, find_offsets
+from .offsets import Offsets, Slopes, find_offsets
 from .residual import ResidualForm
 from .structure import Block, block_triangular, pantelides
 from .systems import System
@@ -28,7 +29,7 @@ class Structure:
       the combination in which they are gone, `residual[1] + residual[0]`.
     - `signature`: for each equation, its variables with the highest derivative that occurs: 0 or 1, more in a combination
       with derivatives of equations.
-    - `index`: the structural index, an upper bound of the differential index where `regular`.
+    - `index`: the structural index, an upper bound of the `differential_index` where `regular`.
     - `degrees_of_freedom`: how many initial values can be chosen.
     - `equation_offsets`, `variable_offsets`: c and d; equation i is to be differentiated cᵢ times, and then determines
       derivatives up to the order dⱼ of variable j (Pryce's Σ-method).
@@ -44,9 +45,9 @@ class Structure:
     Stat. Comput. 9 (1988).
     """
 
-    form: ResidualForm = dataclasses.field(repr=False)
-    combination: Combination = dataclasses.field(repr=False)
-    signature: tuple[dict[int, int], ...] = dataclasses.field(repr=False)
+    form: ResidualForm = dataclasses.field(repr=False, compare=False)
+    found: Offsets = dataclasses.field(repr=False, compare=False)
+    point: tuple[Any, Any] = dataclasses.field(repr=False, compare=False)
     index: int
     degrees_of_freedom: int
     equation_offsets: tuple[int, ...]
@@ -57,9 +58,14 @@ class Structure:
     regular: bool
 
     @property
+    def signature(self) -> tuple[dict[int, int], ...]:
+        """For each equation, its variables with the highest derivative that occurs."""
+        return tuple(self.found.signature)
+
+    @property
     def equations(self) -> tuple[str, ...]:
         """A name for each equation."""
-        return self.combination.names(self.form.equations)
+        return self.found.combination.names(self.form.equations)
 
     @property
     def variables(self) -> tuple[str, ...]:
@@ -81,10 +87,36 @@ class Structure:
 
         def along(t: Any, derivatives: Float[Array, "orders n"]) -> Float[Array, " n"]:
             t = jnp.asarray(t, derivatives.dtype)
-            count = times + 1 + self.combination.degree
-            return self.combination.of(total_derivatives(self.form.residual, t, list(derivatives), count))[times]
+            combination = self.found.combination
+            count = times + 1 + combination.degree
+            return combination.of(total_derivatives(self.form.residual, t, list(derivatives), count))[times]
 
         return along
+
+    @functools.cached_property
+    def differential_index(self) -> int | None:
+        """The smallest k for which F = 0, …, dᵏF/dtᵏ = 0 determine ẏ, found by the ranks of their Jacobian at the given
+        state for generic derivatives; at most `index`. `None` where not `regular`: what is singular there on the solution need
+        not be so for generic derivatives. Takes a moment.
+
+        Source: S. L. Campbell, C. W. Gear, The index of general nonlinear DAEs, Numer. Math. 72 (1995).
+        """
+        n = len(self.equations)
+        for k in range(self.index + 1 if self.regular else 0):
+            slopes, values = _slopes_at(self.form, self.found, *self.point, k)
+            array = np.zeros((k + 1, n, k + 1, n))
+            for level, i in np.ndindex(k + 1, n):
+                for (order, j), value in slopes.by_entry(values, level, i).items():
+                    if order:
+                        array[level, i, order - 1, j] = value
+            matrix = array.reshape((k + 1) * n, -1)
+            for axis in (1, 0):
+                largest = np.abs(matrix).max(axis, keepdims=True)
+                matrix = matrix / np.where(largest > 0, largest, 1)
+            rank = lambda m: np.linalg.matrix_rank(m, rtol=1e-9) if m.size else 0
+            if rank(matrix) == n + rank(matrix[:, n:]):
+                return k
+        return None
 
     def hidden_constraints(self) -> tuple[tuple[str, int], ...]:
         """Which equations, differentiated how often, restrict the initial values: those of lower order than cᵢ."""
@@ -135,12 +167,13 @@ def analyse(system: System, t0: Any, y0: Any, args: Any = None) -> Structure:
     y0 = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
     form = ResidualForm.of(system, t0, y0, args)
     y = form.encode(y0)
+    point = jnp.asarray(t0, y.dtype), y
     found = find_offsets(form, y.dtype)
     sigma = found.sigma
     return Structure(
         form,
-        found.combination,
-        tuple(found.signature),
+        found,
+        point,
         found.index,
         sigma.degrees_of_freedom,
         sigma.equation_offsets,
@@ -148,7 +181,7 @@ def analyse(system: System, t0: Any, y0: Any, args: Any = None) -> Structure:
         pantelides(found.signature).equation_offsets,
         sigma.transversal,
         tuple(block_triangular(found.pattern, sigma.transversal)),
-        _regular(form, found, jnp.asarray(t0, y.dtype), y),
+        _regular(form, found, *point),
     )
 
 
@@ -162,12 +195,8 @@ def _differentiated(times: int) -> str:
 
 def _regular(form: ResidualForm, found: Offsets, t: Any, y: Any) -> bool:
     """Whether the system Jacobian has full rank at the state, for generic derivatives and multipliers."""
-    rng = np.random.default_rng(0)
-    slopes = Slopes(form, found, found.combination.degree, y.dtype)
-    along = jax.jit(slopes.along)
-    for _ in range(3):
-        at = y.at[form.layout.size :].set(rng.normal(size=form.extra))
-        values = np.asarray(along(t, jnp.stack([at, *jnp.asarray(rng.normal(size=slopes.shape), y.dtype)[1:]])))
+    for seed in range(3):
+        slopes, values = _slopes_at(form, found, t, y, found.combination.degree, seed)
         matrix = np.zeros((len(y), len(y)))
         for i, variables in enumerate(found.pattern):
             for k, times, factor in found.combination.terms(i):
@@ -180,3 +209,14 @@ def _regular(form: ResidualForm, found: Offsets, t: Any, y: Any) -> bool:
             if size[-1] > 100 * len(y) * jnp.finfo(y.dtype).eps * size[0]:
                 return True
     return False
+
+
+def _slopes_at(
+    form: ResidualForm, found: Offsets, t: Any, y: Any, degree: int, seed: int = 0
+) -> tuple[Slopes, np.ndarray]:
+    """`Slopes` and what they give at a state, for generic derivatives and multipliers."""
+    rng = np.random.default_rng(seed)
+    slopes = Slopes(form, found, degree, y.dtype)
+    at = y.at[form.layout.size :].set(rng.normal(size=form.extra))
+    orders = jnp.stack([at, *jnp.asarray(rng.normal(size=slopes.shape), y.dtype)[1:]])
+    return slopes, np.asarray(jax.jit(slopes.along)(t, orders))

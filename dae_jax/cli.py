@@ -82,7 +82,7 @@ def _add_analyse(commands: argparse._SubParsersAction) -> None:
 
 
 def _analyse(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> int:
-    from .analyse import analyse
+    from .analyse import DRAWN, analyse
     from .scenes import SCENES, Scene
 
     module, colon, name = arguments.system.partition(":")
@@ -107,6 +107,9 @@ def _analyse(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> 
     except (TypeError, ValueError) as refusal:
         parser.error(str(refusal))
     print(structure)
+    if len(structure.equations) <= DRAWN:
+        by_ranks = structure.differential_index
+        print(f"differential index, by ranks at the start: {'not to be had' if by_ranks is None else by_ranks}")
     if arguments.out is not None:
         from .plotting import incidence
 

@@ -51,6 +51,24 @@ def hessenberg(depth):
     return dae_jax.ImplicitDAE(residual)
 
 
+@pytest.mark.parametrize(
+    ("name", "index"), [("pendulum", 3), ("knife-edge", 2), ("amplifier", 1), ("capacitor-loop", 2), ("jay", 3)]
+)
+def test_differential_index(name, index):
+    assert of_scene(name).differential_index == index
+
+
+def test_a_differential_index_below_the_structural_one():
+    """A family of Reißig, Martinson and Barton: linear, of index 1 and structural index 3."""
+    a = np.array([[0.0, 1, 1, 0, 0], [0, 1, 1, 0, 0], [0, 0, 0, 1, 1], [0, 0, 0, 1, 1], [0, 0, 0, 0, 0]])
+    found = dae_jax.analyse(implicit(lambda t, y, yd, args: a @ yd + y), 0.0, jnp.ones(5))
+    assert (found.index, found.differential_index, found.regular) == (3, 1, True)
+
+
+def test_what_is_singular_on_the_solution_has_no_differential_index():
+    assert of_scene("four-bar-redundant").differential_index is None
+
+
 @pytest.mark.parametrize("index", [1, 2, 3, 4, 5])
 def test_a_chain_of_integrators_has_any_index(index):
     found = dae_jax.analyse(hessenberg(index), 0.0, jnp.zeros(index))
@@ -84,6 +102,12 @@ def test_problems_have_their_published_index(name):
     assert (of_scene(name).index, of_scene(name).regular) == (SCENES[name]().index, True)
 
 
+def hidden(t, y, yd, args):
+    """y₂ · first − y₁ · second has no derivative."""
+    rate = yd[0] + jnp.cos(y[1]) * yd[1]
+    return jnp.stack([y[0] * rate + y[0], y[1] * rate + y[1] ** 2])
+
+
 def implicit(residual):
     return dae_jax.ImplicitDAE(lambda t, y, yd, args: residual(t, y, yd, args))
 
@@ -110,7 +134,7 @@ def test_what_cancels_may_be_a_parameter_or_depend_on_the_state(capacitance):
     while_tracing = []
     look = lambda args: while_tracing.append(find_offsets(ResidualForm.of(system, 0.0, jnp.zeros(3), args), float))
     jax.eval_shape(look, args)
-    assert while_tracing[0].combination == found.combination
+    assert while_tracing[0].combination == found.found.combination
 
 
 def test_what_cancels_with_a_derivative_of_another_equation():
@@ -147,9 +171,7 @@ def test_a_circuit_of_200_nodes():
 
 def test_a_singular_jacobian_behind_a_regular_structure_is_found():
     """The multiple is the state's: y₂ · first − y₁ · second has no derivative, so that the index is 1 and not 0."""
-    rate = lambda y, yd: yd[0] + jnp.cos(y[1]) * yd[1]
-    residual = lambda t, y, yd, a: jnp.stack([y[0] * rate(y, yd) + y[0], y[1] * rate(y, yd) + y[1] ** 2])
-    found = dae_jax.analyse(implicit(residual), 0.0, jnp.ones(2))
+    found = dae_jax.analyse(implicit(hidden), 0.0, jnp.ones(2))
     assert not found.regular
     assert "Replace an equation by a combination" in str(found)
 

@@ -110,7 +110,8 @@ class BDF(AbstractResidualSolver):
 
     For index 0 to 2, and for index 3 in the GGL form and as "index-2". Variables of index 2 and higher, among them the
     multipliers of these forms, follow from the others and are not in the error test: after a change of order or size
-    they are off by O(hᵏ), which would hold the step down and gain nothing.
+    they are off by O(hᵏ), which would hold the step down and gain nothing. Algebraic variables may jump with a source: the
+    smallest step that time resolves counts where the differential variables are accurate, and the history begins anew.
 
     **Arguments**
 

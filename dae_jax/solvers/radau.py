@@ -137,7 +137,8 @@ class RadauIIA5(AbstractResidualSolver):
     while they serve. The error estimate is that of the embedded formula of order 3, filtered by (γ/h ∂F/∂ẏ + ∂F/∂y)⁻¹;
     errors of variables of index k count with h^(k−1). Orders: 5 for ODEs and index 1; for index 2, 5 for the
     differential variables and 3 for the algebraic ones; for index 3, 5, 3 and 2 for variables of index 1, 2 and 3.
-    Constraints of the form hold at the end of each step to the tolerance of Newton's method.
+    Constraints of the form hold at the end of each step to the tolerance of Newton's method. Algebraic variables may jump
+    with a source: in the smallest step that time resolves, each correction has a Jacobian of its own.
 
     **Arguments**
 
