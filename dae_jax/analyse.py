@@ -46,7 +46,7 @@ class Structure:
     """
 
     form: ResidualForm = dataclasses.field(repr=False, compare=False)
-    found: Offsets = dataclasses.field(repr=False, compare=False)
+    offsets: Offsets = dataclasses.field(repr=False, compare=False)
     point: tuple[Any, Any] = dataclasses.field(repr=False, compare=False)
     index: int
     degrees_of_freedom: int
@@ -60,12 +60,12 @@ class Structure:
     @property
     def signature(self) -> tuple[dict[int, int], ...]:
         """For each equation, its variables with the highest derivative that occurs."""
-        return tuple(self.found.signature)
+        return tuple(self.offsets.signature)
 
     @property
     def equations(self) -> tuple[str, ...]:
         """A name for each equation."""
-        return self.found.combination.names(self.form.equations)
+        return self.offsets.combination.names(self.form.equations)
 
     @property
     def variables(self) -> tuple[str, ...]:
@@ -87,7 +87,7 @@ class Structure:
 
         def along(t: Any, derivatives: Float[Array, "orders n"]) -> Float[Array, " n"]:
             t = jnp.asarray(t, derivatives.dtype)
-            combination = self.found.combination
+            combination = self.offsets.combination
             count = times + 1 + combination.degree
             return combination.of(total_derivatives(self.form.residual, t, list(derivatives), count))[times]
 
@@ -103,7 +103,7 @@ class Structure:
         """
         n = len(self.equations)
         for k in range(self.index + 1 if self.regular else 0):
-            slopes, values = _slopes_at(self.form, self.found, *self.point, k)
+            slopes, values = _slopes_at(self.form, self.offsets, *self.point, k)
             array = np.zeros((k + 1, n, k + 1, n))
             for level, i in np.ndindex(k + 1, n):
                 for (order, j), value in slopes.by_entry(values, level, i).items():

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -62,7 +62,8 @@ class Combination:
         return tuple(map(written, range(len(equations))))
 
 
-class Offsets(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class Offsets:
     """What the Σ-method finds of F̄. `by_y`, `by_rate`: the patterns of the Jacobians of F."""
 
     by_y: Bool[np.ndarray, "n n"]
@@ -71,7 +72,7 @@ class Offsets(NamedTuple):
     sigma: SigmaAnalysis
     combination: Combination = Combination()
 
-    @property
+    @functools.cached_property
     def indices(self) -> tuple[int, ...]:
         """The index of each variable."""
         c, combination = self.sigma.equation_offsets, self.combination
@@ -83,7 +84,7 @@ class Offsets(NamedTuple):
         """The structural index: how often equations must be differentiated for the derivatives of all variables."""
         return max(self.indices, default=0)
 
-    @property
+    @functools.cached_property
     def pattern(self) -> list[list[int]]:
         """The variables of each row of the system Jacobian."""
         return jacobian_pattern(self.signature, self.sigma.equation_offsets, self.sigma.variable_offsets)
@@ -163,7 +164,7 @@ def _combined(slopes: Callable[[int], _Polynomials | None], before: Offsets) -> 
     for i, terms_of_row in replaced.items():
         rows[i] = {j: k for k, j, _ in sorted(_summed(terms_of_row, found))}
     try:
-        after = before._replace(signature=rows, sigma=sigma_method(rows), combination=combination)
+        after = dataclasses.replace(before, signature=rows, sigma=sigma_method(rows), combination=combination)
     except StructurallySingular:
         # An equation that says nothing: the system Jacobian is left singular.
         return None

@@ -149,7 +149,7 @@ class Pencil(eqx.Module):
     def _combined(self, rows: Any, c: Any) -> Any:
         """Rows, or right-hand sides, in the combination in which highest derivatives do not cancel, with c for d/dt."""
         combination = self.outline.combination
-        return combination.of([rows * c**k for k in range(combination.degree + 1)])[0]
+        return combination.of([rows * c**k if k else rows for k in range(combination.degree + 1)])[0]
 
     def rates(self, t: Any, y: Float[Array, " n"]) -> Float[Array, " n"]:
         """ẏ with F(t, y, ẏ) = 0 where y is consistent, else with the least F; for variables whose derivative does not occur

@@ -81,6 +81,8 @@ class Flat:
 
     def land(self, t: Any, y: Any) -> tuple[Any, Any]:
         """Where a point lands, and whether it was found."""
+        if self._land is identity:
+            return y, True
         end, found = self._land(t, self.tree(y))
         return self.vector(end), found
 
@@ -153,6 +155,8 @@ def with_landing(error: Array, ahead: Array, landed: Array) -> Array:
     """The error, and where it is more how far the end was moved: a manifold that jumps does not show in the stages. What
     the user's start may be off by does not count.
     """
+    if landed is ahead:
+        return error
     moved = landed - ahead
     allowed = 2 * float(jnp.finfo(moved.dtype).eps) ** 0.5 * (1 + jnp.max(jnp.abs(landed)))
     return jnp.where(jnp.abs(moved) > jnp.maximum(jnp.abs(error), allowed), moved, error)

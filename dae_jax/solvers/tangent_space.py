@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from .explicit import Unrolled, unrolled
+from .explicit import Unrolled, identity, unrolled
 from .manifold import AbstractManifoldSolver, clock, or_nan, outcome
 
 
@@ -99,7 +99,7 @@ class TangentSpace(AbstractManifoldSolver, diffrax.AbstractAdaptiveSolver):
         first = args.tangent(derivative, chart) if made_jump is False else None
         first = tangent_term.vf(t0, y0, None) if first is None else first
         wrapped = _Controlled(tangent_term, terms)
-        u1, error, dense, _, _ = solver.landing_step(wrapped, t0, t1, y0, None, first, False, lambda t, u: (u, True))
+        u1, error, dense, _, _ = solver.landing_step(wrapped, t0, t1, y0, None, first, False, identity)
         y1, found = args.restore(sign * t1, u1, chart)
         y1 = or_nan(found, y1)
         end = terms.vf(t1, y1, args)
