@@ -11,6 +11,7 @@ import pytest
 
 import dae_jax
 from dae_jax.kernels import configure, hindrances, one_kernel, polynomials, scalarise, subroutine
+from dae_jax.kernels.native import machine
 
 
 def length(x):
@@ -252,22 +253,41 @@ class TestHindrances:
 
     def test_one_scatter_window_does_not_hinder(self):
         assert hindrances(jax.make_jaxpr(lambda x: x.at[1].set(0))(X)) == ()
-        assert hindrances(jax.make_jaxpr(lambda x: x.at[jnp.array([0, 2])].set(0))(X)) != ()
+
+    def test_several_scatter_windows_hinder_xla(self, monkeypatch):
+        several = jax.make_jaxpr(lambda x: x.at[jnp.array([0, 2])].set(0))(X)
+        assert hindrances(several) == ()
+        monkeypatch.setattr(machine, "available", lambda: False)
+        assert hindrances(several) == ("scatter",)
 
 
 def is_marked(fn, *args):
     return "xla_cpu_small_call" in jax.jit(fn).lower(*args).as_text()
 
 
+def is_native(fn, *args):
+    return "@dae_jax_" in jax.jit(fn).lower(*args).as_text()
+
+
+@pytest.fixture(params=["native", "xla"])
+def is_one_kernel(request, monkeypatch):
+    """Whether a function is one kernel, with our own compiler or without."""
+    if request.param == "xla":
+        monkeypatch.setattr(machine, "available", lambda: False)
+        return is_marked
+    return is_native
+
+
 def two_results(p):
     return {"y": loop(p["x"]), "n": p["n"] + 1}
 
 
+@pytest.mark.usefixtures("is_one_kernel")
 class TestOneKernel:
-    def test_is_marked(self):
-        assert is_marked(one_kernel(loop, "forward"), X)
-        assert not is_marked(one_kernel(loop), X)
-        assert not is_marked(one_kernel(lambda x: jnp.sort(loop(x)), "forward"), X)
+    def test_is_one_kernel(self, is_one_kernel):
+        assert is_one_kernel(one_kernel(loop, "forward"), X)
+        assert not is_one_kernel(one_kernel(loop), X)
+        assert not is_one_kernel(one_kernel(lambda x: jnp.sort(loop(x)), "forward"), X)
 
     def test_configure(self):
         with configure(one_kernel=False):
@@ -285,7 +305,7 @@ class TestOneKernel:
         close(jax.jit(jax.vmap(one_kernel(loop, derivative)))(xs), jax.vmap(loop)(xs))
 
     @pytest.mark.parametrize("derivative", ["forward", "reverse"])
-    def test_vmap_of_what_would_scatter_is_one_kernel_too(self, derivative):
+    def test_vmap_of_what_would_scatter_is_one_kernel_too(self, derivative, is_one_kernel):
         """Lanes that write at places of their own cannot run in step in a kernel, but one after another."""
 
         def writes(x):
@@ -295,7 +315,7 @@ class TestOneKernel:
         xs = jnp.stack([X, 2 * X, 0.1 * X])
         fused = jax.vmap(one_kernel(writes, derivative))
         close(jax.jit(fused)(xs), jax.vmap(writes)(xs))
-        assert is_marked(fused, xs)
+        assert is_one_kernel(fused, xs)
         nested = jax.vmap(jax.vmap(one_kernel(writes, derivative)))
         twice = jnp.stack([xs, 3 * xs])
         close(jax.jit(nested)(twice), jax.vmap(jax.vmap(writes))(twice))
@@ -303,11 +323,11 @@ class TestOneKernel:
     def test_unused_arguments_do_no_harm(self):
         close(jax.jit(one_kernel(lambda x, y, z: loop(y), "forward"))(X, 2 * X, V), loop(2 * X))
 
-    def test_forward_derivatives(self):
+    def test_forward_derivatives(self, is_one_kernel):
         fused = one_kernel(loop, "forward")
         close(jax.jit(jax.jacfwd(fused))(X), jax.jacfwd(loop)(X))
         close(jax.jit(jax.jacfwd(jax.jacfwd(fused)))(X), jax.jacfwd(jax.jacfwd(loop))(X))
-        assert is_marked(lambda x: jax.jvp(fused, (x,), (V,))[1], X)
+        assert is_one_kernel(lambda x: jax.jvp(fused, (x,), (V,))[1], X)
 
     def test_reverse_derivatives(self):
         fused = one_kernel(loop, "reverse")
@@ -358,6 +378,7 @@ def test_printing_from_a_users_function_prevents_one_kernel(capfd):
     assert "t = " in capfd.readouterr().out
 
 
+@pytest.mark.usefixtures("is_one_kernel")
 @pytest.mark.parametrize("function", [jnp.sin, lambda x: jnp.where(x > 1, 0.5 * x, x)])
 def test_what_xla_would_share_among_threads_is_in_a_kernel_all_the_same(function):
     """A function of half a megabyte, in a loop of a length that is not known."""

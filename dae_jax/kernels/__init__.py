@@ -2,16 +2,16 @@
 
 from .gathers import gathered as gathered, windows as windows
 from .jaxprs import equations as equations, is_large as is_large
+from .kernel_call import hindrances as hindrances
 from .numbers import on_numbers as on_numbers
 from .one_kernel import (
     PullBack as PullBack,
     configure as configure,
-    hindrances as hindrances,
     inexact as inexact,
     one_kernel as one_kernel,
     one_kernel_enabled as one_kernel_enabled,
-    without_checks as without_checks,
 )
 from .polynomials import Polynomial as Polynomial, polynomials as polynomials
 from .scalarise import scalarise as scalarise
 from .subroutine import subroutine as subroutine
+from .unchecked import without_checks as without_checks

@@ -23,7 +23,7 @@ ELEMENTWISE = frozenset(
     "erf erf_inv erfc exp exp2 expm1 floor ge gt integer_pow is_finite le lgamma log log1p logistic lt max min mul ne "
     "neg nextafter not or pow rem round rsqrt select_n sign sin sinh sqrt square sub tan tanh xor".split()
 )
-_STRUCTURAL = frozenset(
+STRUCTURAL = frozenset(
     "add_any broadcast_in_dim concatenate copy copy_p dot_general dynamic_slice expand_dims gather iota pad reduce_max "
     "reduce_sum reshape rev slice split squeeze stack stop_gradient transpose".split()
 )
@@ -134,7 +134,7 @@ class EntryByEntry:
             return [self.elementwise(eqn, args)]
         if name in _SCATTERS:
             return [self.scatter(eqn, args)]
-        if name not in _STRUCTURAL:
+        if name not in STRUCTURAL:
             raise NotEntryByEntry
         out = getattr(self, name)(eqn, args)
         return out if isinstance(out, list) else [out]

@@ -33,7 +33,7 @@ def semidefinite_solve(
         return jax.scipy.linalg.cho_solve(factor, b)
     if m > UNROLLED:
         return _looped(s, b)
-    return _unrolled(s, b)
+    return _by_determinant(s, b) if m == 2 else _unrolled(s, b)
 
 
 def smallest_pivot(s: Float[Array, "m m"]) -> Float[Array, ""]:
@@ -53,6 +53,14 @@ def smallest_pivot(s: Float[Array, "m m"]) -> Float[Array, ""]:
 def definite_pivot(pivot: Float[Array, "*k"], diagonal: Float[Array, "*k"], m: int) -> Float[Array, "*k"]:
     """The pivot of an m×m matrix, or NaN where it is round-off of the diagonal entry that it was."""
     return jnp.where(pivot > 8 * m * float(jnp.finfo(pivot.dtype).eps) * diagonal, pivot, jnp.nan)
+
+
+def _by_determinant(s: Float[Array, "2 2"], b: Float[Array, "2 *k"]) -> Float[Array, "2 *k"]:
+    """Cramer's rule: one division where elimination waits for two, and as accurate for two unknowns (Higham, 1.10.1)."""
+    product, determinant = s[0, 0] * s[1, 1], s[0, 0] * s[1, 1] - s[1, 0] * s[1, 0]
+    definite = (s[0, 0] > 0) & (determinant > 16 * float(jnp.finfo(s.dtype).eps) * product)
+    inverse = jnp.where(definite, 1 / determinant, jnp.nan)
+    return jnp.stack([(s[1, 1] * b[0] - s[1, 0] * b[1]) * inverse, (s[0, 0] * b[1] - s[1, 0] * b[0]) * inverse])
 
 
 def _unrolled(s: Float[Array, "m m"], b: Float[Array, "m *k"]) -> Float[Array, "m *k"]:

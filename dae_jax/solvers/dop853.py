@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from . import dop853_coefficients as coefficients
-from .explicit import Flat, combine, first_derivative, identity, increments, with_landing
+from .explicit import Flat, advanced, combine, first_derivative, identity, stage_slopes, with_landing
 
 
 STAGES = 12
@@ -71,26 +71,26 @@ class DOP853(diffrax.AbstractAdaptiveSolver):
         """`step`, with its end moved to `land(t1, y1)` → (y1, found)."""
         h = terms.contr(t0, t1)
         flat = Flat(terms, t0, y0, args, land)
-        increment = lambda t, y: h * flat.field(t, y)
-        k0 = h * first_derivative(flat, t0, state, made_jump)
-        ks = increments(_ROWS[: STAGES - 1], coefficients.C[1:STAGES], increment, t0, t1, flat.y0, k0, flat.looped)
-        ahead = combine(coefficients.B, ks, flat.y0)
+        f0 = first_derivative(flat, t0, state, made_jump)
+        rows, nodes = _ROWS[: STAGES - 1], coefficients.C[1:STAGES]
+        fs = stage_slopes(rows, nodes, flat.field, t0, t1, h, flat.y0, f0, flat.looped)
+        ahead = flat.y0 + h * combine(coefficients.B, fs)
         y1, found = flat.land(t1, ahead)
         f1 = flat.field(t1, y1)
-        ks.append(h * f1)
-        error = _error(combine(coefficients.E5, ks), combine(coefficients.E3, ks), flat.y0, y1)
+        fs.append(f1)
+        error = h * _error(combine(coefficients.E5, fs), combine(coefficients.E3, fs), flat.y0, y1)
         error = with_landing(error, ahead, y1)
-        rest = self._interpolant(increment, t0, t1, flat.y0, y1, ks) if self.dense else [y1 - flat.y0]
+        rest = self._interpolant(flat, t0, t1, h, y1, fs) if self.dense else [y1 - flat.y0]
         dense = {"y0": y0, "f": jax.tree.map(lambda *f: jnp.stack(f), *map(flat.tree, rest))}
         return flat.tree(y1), flat.tree(error), dense, flat.tree(f1), found
 
-    def _interpolant(self, increment: Any, t0: Any, t1: Any, y0: Any, y1: Any, ks: list[Any]) -> list[Any]:
+    def _interpolant(self, flat: Flat, t0: Any, t1: Any, h: Any, y1: Any, fs: list[Any]) -> list[Any]:
         """The coefficients of the nested form."""
         for row, c in zip(_ROWS[STAGES:], coefficients.C[STAGES + 1 :], strict=True):
-            ks = [*ks, increment(t0 + float(c) * (t1 - t0), combine(row, ks, y0))]
-        first, last = ks[0], ks[STAGES]
-        slopes = [y1 - y0, first - (y1 - y0), 2 * (y1 - y0) - (first + last)]
-        return slopes + [combine(row, ks) for row in coefficients.D]
+            fs = [*fs, flat.field(t0 + float(c) * (t1 - t0), advanced(flat.y0, h, row, fs))]
+        first, last, change = h * fs[0], h * fs[STAGES], y1 - flat.y0
+        slopes = [change, first - change, 2 * change - (first + last)]
+        return slopes + [h * combine(row, fs) for row in coefficients.D]
 
 
 def _error(e5: Any, e3: Any, y0: Any, y1: Any) -> Any:

@@ -22,47 +22,54 @@ def identity(_: Any, y: Any) -> tuple[Any, bool]:
     return y, True
 
 
-def combine(coefficients: Sequence[float] | np.ndarray, stages: Sequence[Any], y: Any = None) -> Any:
-    """y + Σ cᵢ kᵢ over the coefficients that are not zero."""
-    total = sum(float(c) * k for c, k in zip(coefficients, stages, strict=False) if c != 0)
-    return total if y is None else y + total
+def combine(coefficients: Sequence[float] | np.ndarray, slopes: Sequence[Any]) -> Any:
+    """Σ cᵢ fᵢ over the coefficients that are not zero."""
+    return sum(float(c) * f for c, f in zip(coefficients, slopes, strict=False) if c != 0)
 
 
-def increments(
+def advanced(y: Any, h: Any, coefficients: Sequence[float] | np.ndarray, slopes: Sequence[Any]) -> Any:
+    """y + h Σ cᵢ fᵢ; the newest slope comes last, one multiplication and one addition before the result."""
+    for c, f in zip(coefficients, slopes, strict=False):
+        y = y + (h * float(c)) * f if c != 0 else y
+    return y
+
+
+def stage_slopes(
     a: Sequence[np.ndarray],
     c: np.ndarray,
-    vector: Callable[[Any, Any], Any],
+    field: Callable[[Any, Any], Any],
     t0: Any,
     t1: Any,
+    h: Any,
     y0: Any,
-    k0: Any,
+    f0: Any,
     looped: bool,
 ) -> list[Any]:
-    """kᵢ = h f(t₀ + cᵢ h, y₀ + Σ aᵢⱼ kⱼ) for an explicit tableau; `vector(t, y)` is h f, `k0` the first.
+    """fᵢ = f(t₀ + cᵢ h, y₀ + h Σ aᵢⱼ fⱼ) for an explicit tableau, `f0` the first.
 
     `looped`: the stages in a loop in place of one after the other.
     """
     if looped:
-        return _increments_in_a_loop(a, c, vector, t0, t1, y0, k0)
-    ks = [k0]
+        return _slopes_in_a_loop(a, c, field, t0, t1, h, y0, f0)
+    fs = [f0]
     for row, ci in zip(a, c, strict=True):
         ti = t1 if ci == 1 else t0 + float(ci) * (t1 - t0)
-        ks.append(vector(ti, combine(row, ks, y0)))
-    return ks
+        fs.append(field(ti, advanced(y0, h, row, fs)))
+    return fs
 
 
-def _increments_in_a_loop(a: Any, c: Any, vector: Any, t0: Any, t1: Any, y0: Any, k0: Any) -> list[Any]:
+def _slopes_in_a_loop(a: Any, c: Any, field: Any, t0: Any, t1: Any, h: Any, y0: Any, f0: Any) -> list[Any]:
     stages = len(a) + 1
-    rows = jnp.asarray([[*row, *[0.0] * (stages - len(row))] for row in a], y0.dtype)
+    rows = h * jnp.asarray([[*row, *[0.0] * (stages - len(row))] for row in a], y0.dtype)
     nodes = jnp.asarray(c, jnp.result_type(t0))
 
-    def stage(i: Any, ks: Any) -> Any:
+    def stage(i: Any, fs: Any) -> Any:
         ti = jnp.where(nodes[i] == 1, t1, t0 + nodes[i] * (t1 - t0))
-        yi = y0 + sum(rows[i, j] * ks[j] for j in range(stages - 1))
-        return jax.lax.dynamic_update_index_in_dim(ks, vector(ti, yi), i + 1, 0)
+        yi = y0 + sum(rows[i, j] * fs[j] for j in range(stages - 1))
+        return jax.lax.dynamic_update_index_in_dim(fs, field(ti, yi), i + 1, 0)
 
-    ks = jnp.zeros((stages, y0.size), y0.dtype).at[0].set(k0)
-    return list(jax.lax.fori_loop(0, stages - 1, stage, ks))
+    fs = jnp.zeros((stages, y0.size), y0.dtype).at[0].set(f0)
+    return list(jax.lax.fori_loop(0, stages - 1, stage, fs))
 
 
 class Flat:
@@ -132,22 +139,22 @@ class Unrolled(diffrax.AbstractWrappedSolver):
         tableau = self.solver.tableau
         h = terms.contr(t0, t1)
         flat = Flat(terms, t0, y0, args, land)
-        increment = lambda t, y: h * flat.field(t, y)
-        k0 = h * first_derivative(flat, t0, state, made_jump)
+        f0 = first_derivative(flat, t0, state, made_jump)
         rows, nodes = tableau.a_lower, tableau.c
         f1 = None
         if tableau.fsal:
-            ks = increments(rows[:-1], nodes[:-1], increment, t0, t1, flat.y0, k0, flat.looped)
-            ahead = combine(rows[-1], ks, flat.y0)
+            fs = stage_slopes(rows[:-1], nodes[:-1], flat.field, t0, t1, h, flat.y0, f0, flat.looped)
+            ahead = flat.y0 + h * combine(rows[-1], fs)
             y1, found = flat.land(t1, ahead)
             f1 = flat.field(t1, y1)
-            ks.append(h * f1)
+            fs.append(f1)
         else:
-            ks = increments(rows, nodes, increment, t0, t1, flat.y0, k0, flat.looped)
-            ahead = combine(tableau.b_sol, ks, flat.y0)
+            fs = stage_slopes(rows, nodes, flat.field, t0, t1, h, flat.y0, f0, flat.looped)
+            ahead = flat.y0 + h * combine(tableau.b_sol, fs)
             y1, found = flat.land(t1, ahead)
-        error = flat.tree(with_landing(combine(tableau.b_error, ks), ahead, y1)) if np.any(tableau.b_error) else None
-        dense = {"y0": y0, "y1": flat.tree(y1), "k": jax.tree.map(lambda *k: jnp.stack(k), *map(flat.tree, ks))}
+        estimates = np.any(tableau.b_error)
+        error = flat.tree(with_landing(h * combine(tableau.b_error, fs), ahead, y1)) if estimates else None
+        dense = {"y0": y0, "y1": flat.tree(y1), "k": jax.tree.map(lambda *f: h * jnp.stack(f), *map(flat.tree, fs))}
         return flat.tree(y1), error, dense, None if f1 is None else flat.tree(f1), found
 
 

@@ -1,0 +1,143 @@
+"""Machine code for the host from LLVM's intermediate representation, as a function that XLA calls.
+
+XLA calls foreign functions through a C interface (xla/ffi/api/c_api.h): a call frame with the arguments' and the
+results' buffers goes in, an error (null: none) comes out. The offsets below are those of its structures where pointers
+have 64 bits.
+"""
+
+import ctypes
+import functools
+import hashlib
+import platform
+import threading
+from typing import Any
+
+import jax
+import llvmlite.binding as llvm
+
+
+# The kernel gets the arrays of argument and result buffers. A call with an extension of type 1 asks for the version of
+# the interface: the answer is that of the caller, since nothing but these offsets is used of it.
+_HANDLER = """
+define ptr @{name}(ptr %frame) {{
+entry:
+  %extension.at = getelementptr i8, ptr %frame, i64 8
+  %extension = load ptr, ptr %extension.at
+  %is.call = icmp eq ptr %extension, null
+  br i1 %is.call, label %call, label %ask
+ask:
+  %type.at = getelementptr i8, ptr %extension, i64 8
+  %type = load i32, ptr %type.at
+  %asks = icmp eq i32 %type, 1
+  br i1 %asks, label %answer, label %call
+answer:
+  %metadata.at = getelementptr i8, ptr %extension, i64 24
+  %metadata = load ptr, ptr %metadata.at
+  %api.at = getelementptr i8, ptr %frame, i64 16
+  %api = load ptr, ptr %api.at
+  %version.at = getelementptr i8, ptr %api, i64 32
+  %version = load i64, ptr %version.at
+  %version.to = getelementptr i8, ptr %metadata, i64 24
+  store i64 %version, ptr %version.to
+  ret ptr null
+call:
+  %args.at = getelementptr i8, ptr %frame, i64 72
+  %args = load ptr, ptr %args.at
+  %results.at = getelementptr i8, ptr %frame, i64 112
+  %results = load ptr, ptr %results.at
+  call void @{name}.kernel(ptr %args, ptr %results)
+  ret ptr null
+}}
+"""
+_DATA_OF_BUFFER = 24
+
+_lock = threading.Lock()
+_engines: dict[str, Any] = {}
+
+
+def available() -> bool:
+    """Whether code for this host can be made."""
+    return platform.system() in ("Linux", "Darwin") and ctypes.sizeof(ctypes.c_void_p) == 8
+
+
+def buffer(array: str, k: int, name: str) -> list[str]:
+    """The instructions that find the numbers of the k-th buffer of an array of buffers."""
+    return [
+        f"%{name}.at = getelementptr ptr, ptr {array}, i64 {k}",
+        f"%{name}.buffer = load ptr, ptr %{name}.at",
+        f"%{name}.data = getelementptr i8, ptr %{name}.buffer, i64 {_DATA_OF_BUFFER}",
+        f"%{name} = load ptr, ptr %{name}.data",
+    ]
+
+
+@functools.cache
+def host() -> Any:
+    """The machine that code is made for."""
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    features = llvm.get_host_cpu_features().flatten()
+    return llvm.Target.from_default_triple().create_target_machine(
+        cpu=llvm.get_host_cpu_name(), features=features, opt=3, codemodel="jitdefault", jit=True
+    )
+
+
+@functools.cache
+def vector_size() -> int:
+    """How many numbers of 64 bits the host's vectors hold."""
+    features = llvm.get_host_cpu_features()
+    return 8 if features.get("avx512f") else 4 if features.get("avx2") else 2
+
+
+@functools.cache
+def has_symbol(name: str) -> bool:
+    """Whether the process has a function of the C library by this name."""
+    return hasattr(ctypes.CDLL(None), name)
+
+
+@functools.cache
+def _vector_library() -> Any:
+    try:
+        library = ctypes.CDLL("libmvec.so.1")
+    except OSError:
+        return None
+    llvm.load_library_permanently("libmvec.so.1")
+    return library
+
+
+@functools.cache
+def vector_function(name: str, arguments: int) -> str | None:
+    """The C library's function of this name for vectors of doubles, right to a few units in the last place."""
+    width = vector_size()
+    kind = {2: "b", 4: "d", 8: "e"}[width]
+    full = f"_ZGV{kind}N{width}{'v' * arguments}_{name}"
+    return full if hasattr(_vector_library(), full) else None
+
+
+def register(module: str) -> str:
+    """Compiles a module with a function `{name}.kernel`, and gives the name by which XLA calls it.
+
+    `module` is a format string for `{name}`, which is made of its contents: equal programs are compiled once, also where
+    XLA's compilation cache holds the program that calls them.
+    """
+    name = "dae_jax_" + hashlib.sha256(module.encode()).hexdigest()[:32]
+    with _lock:
+        if name not in _engines:
+            _engines[name] = _compiled(module.replace("{name}", name) + _HANDLER.format(name=name))
+            address = _engines[name].get_function_address(name)
+            handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(address)
+            jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler), platform="cpu")
+            _engines[name, "handler"] = handler
+    return name
+
+
+def _compiled(text: str) -> Any:
+    machine = host()
+    module = llvm.parse_assembly(text)
+    # Without the vectorisation of straight-line code: it gains nothing here, and LLVM 22.1 breaks some functions by it.
+    tuning = llvm.create_pipeline_tuning_options(speed_level=2)
+    tuning.slp_vectorization = False
+    passes = llvm.create_pass_builder(machine, tuning)
+    passes.getModulePassManager().run(module, passes)
+    engine = llvm.create_mcjit_compiler(module, machine)
+    engine.finalize_object()
+    return engine
