@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import batching, mlir
+from jax.interpreters.partial_eval import dce_jaxpr
 
 from . import native, xla_kernel
 from .entries import NotEntryByEntry
@@ -33,13 +34,13 @@ def called(jaxpr: ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
     constants = [x for x in jaxpr.consts if isinstance(x, jax.core.Tracer)]
     if hindrances(jaxpr) or jaxpr.effects or constants:
         return jax.jit(jaxpr_as_fun(jaxpr))(*args)
-    # Tangents of integers are no numbers.
-    known = [v.aval.dtype != jax.dtypes.float0 for v in jaxpr.jaxpr.outvars]
-    outvars = [v for v, k in zip(jaxpr.jaxpr.outvars, known, strict=True) if k]
-    numbers = iter(_bind(ClosedJaxpr(jaxpr.jaxpr.replace(outvars=outvars), jaxpr.consts), (), args))
+    # Tangents of integers are no numbers. XLA aborts where a parameter of a kernel is not used.
+    outvars = jaxpr.jaxpr.outvars
+    known = [v.aval.dtype != jax.dtypes.float0 for v in outvars]
+    needed, used = dce_jaxpr(jaxpr.jaxpr, known)
+    numbers = iter(_bind(ClosedJaxpr(needed, jaxpr.consts), (), [x for x, u in zip(args, used, strict=True) if u]))
     return [
-        next(numbers) if k else np.zeros(v.aval.shape, jax.dtypes.float0)
-        for v, k in zip(jaxpr.jaxpr.outvars, known, strict=True)
+        next(numbers) if k else np.zeros(v.aval.shape, jax.dtypes.float0) for v, k in zip(outvars, known, strict=True)
     ]
 
 

@@ -14,7 +14,7 @@ from ..kernels import is_large, scalarise, subroutine
 
 
 # A larger state goes through the stages in a loop, as one with a large field does: seconds in place of a minute to compile.
-UNROLLED = 8
+UNROLLED = 40
 
 
 def identity(_: Any, y: Any) -> tuple[Any, bool]:

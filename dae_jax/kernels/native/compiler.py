@@ -17,7 +17,8 @@ from .primitives import LARGE, SMALL
 
 # More instructions than these take longer to compile than they save.
 LIMIT = 60_000
-_DIMENSIONS_OF_BUFFER = 40
+# Fewer vectors than these are not worth the 20 µs that it takes to start a thread.
+VECTORS = 4
 
 
 def hindrances(jaxpr: ClosedJaxpr) -> tuple[str, ...]:
@@ -46,32 +47,35 @@ def written(jaxpr: ClosedJaxpr, batched: Sequence[bool] = ()) -> str:
     """
     lanes = any(batched)
     code = Memory(machine.vector_size() if lanes else 1)
-    of_args = [line for k in range(len(jaxpr.jaxpr.invars)) for line in machine.buffer("%args", k, f"arg{k}")]
-    of_results = [line for k in range(len(jaxpr.jaxpr.outvars)) for line in machine.buffer("%results", k, f"result{k}")]
-    inputs = [(v.aval, Buffer(f"%arg{k}", kind_of(v.aval.dtype), False, False)) for k, v in enumerate(jaxpr.jaxpr.invars)]
-    outputs = [(v.aval, Buffer(f"%result{k}", kind_of(v.aval.dtype), False)) for k, v in enumerate(jaxpr.jaxpr.outvars)]
+    code.block = "start"
+    ins, outs = jaxpr.jaxpr.invars, jaxpr.jaxpr.outvars
+    inputs = [(v.aval, Buffer(f"%arg{k}", kind_of(v.aval.dtype), False, False)) for k, v in enumerate(ins)]
+    outputs = [(v.aval, Buffer(f"%result{k}", kind_of(v.aval.dtype), False)) for k, v in enumerate(outs)]
     if lanes:
         _batch(code, jaxpr, inputs, outputs, batched)
     else:
         _one(code, jaxpr, inputs, outputs, [0] * len(inputs), 0)
-    heap = []
+    found = [line for k in range(len(ins)) for line in machine.buffer("%args", k, f"arg{k}")]
+    found += [line for k in range(len(outs)) for line in machine.buffer("%results", k, f"result{k}")]
     if code.heap:
         code.function("malloc", "ptr", "i64")
         code.function("free", "void", "ptr")
-        heap = [f"%heap.raw = call ptr @malloc(i64 {code.heap + 64})", "%heap.int = ptrtoint ptr %heap.raw to i64",
-                "%heap.up = add i64 %heap.int, 63", "%heap.aligned = and i64 %heap.up, -64",
-                "%heap = inttoptr i64 %heap.aligned to ptr"]  # fmt: skip
+        found += [
+            f"%heap.raw = call ptr @malloc(i64 {code.heap + 64})",
+            "%heap.int = ptrtoint ptr %heap.raw to i64",
+            "%heap.up = add i64 %heap.int, 63",
+            "%heap.aligned = and i64 %heap.up, -64",
+            "%heap = inttoptr i64 %heap.aligned to ptr",
+        ]
         code.lines.append("call void @free(ptr %heap.raw)")
-    body = ["entry:", *of_args, *of_results, *heap, *code.stack, "br label %start", "start:", *code.lines, "ret void"]
-    return "\n".join(
-        [*code.constants, *code.declared.values(), "define void @{name}.kernel(ptr %args, ptr %results) {", *body, "}"]
-    )
+    body = [*found, *code.stack, "br label %start", "start:", *code.lines]
+    functions = machine.in_threads(body, list(batched).index(True), VECTORS * code.width) if lanes else machine.alone(body)
+    return "\n".join([*code.constants, *code.declared.values(), *functions])
 
 
 def _one(
     code: Memory, jaxpr: ClosedJaxpr, inputs: Any, outputs: Any, rows: list[Any], row: Any, mask: Value | None = None
 ) -> None:
-    code.block = "start" if code.block == "entry" else code.block
     args = []
     for (aval, buffer), at in zip(inputs, rows, strict=True):
         x = View(buffer, np.dtype(aval.dtype), aval.shape, row_major(aval.shape), code.times(at, aval.size))
@@ -92,22 +96,30 @@ def _one(
 def _batch(code: Memory, jaxpr: ClosedJaxpr, inputs: Any, outputs: Any, batched: Sequence[bool]) -> None:
     """Vectors of lanes, one after another; the lanes that the last one has too many repeat the last element."""
     first, width = list(batched).index(True), code.width
-    code.block = "start"
+    size, last = Value("%batch", "i64"), Value("%batch.last", "i64")
     code.stack += [
-        f"%dims.at = getelementptr i8, ptr %arg{first}.buffer, i64 {_DIMENSIONS_OF_BUFFER}",
+        f"%dims.at = getelementptr i8, ptr %arg{first}.buffer, i64 {machine.DIMENSIONS_OF_BUFFER}",
         "%dims = load ptr, ptr %dims.at",
-        "%batch = load i64, ptr %dims",
-        f"%batch.up = add i64 %batch, {width - 1}",
-        f"%vectors = sdiv i64 %batch.up, {width}",
-        "%batch.last = sub i64 %batch, 1",
+        f"{size.name} = load i64, ptr %dims",
+        f"{last.name} = sub i64 {size.name}, 1",
     ]
     lanes = Value("<" + ", ".join(f"i64 {k}" for k in range(width)) + ">", "i64", True)
-    with code.loop(Value("%vectors", "i64")) as i:
-        place = code.op("add", "i64", code.op("mul", "i64", i, width), lanes)
-        row = code.intrinsic("smin", "i64", place, Value("%batch.last", "i64"))
-        inside = code.op("icmp sle", "i64", place, Value("%batch.last", "i64"), result="i1")
-        rows = [row if b else 0 for b in batched]
-        _one(code, jaxpr, inputs, outputs, rows, row, inside)
+    more, done = code.name(), code.name()
+    code.jump("next")
+    code.label("next")
+    # Threads take vectors as they get on.
+    taken = code.write("atomicrmw add ptr %taken, i64 1 monotonic", "i64", False)
+    start = code.op("mul", "i64", taken, width)
+    left = code.op("icmp slt", "i64", start, size, result="i1")
+    code.lines.append(f"br i1 {left.name}, label %{more}, label %{done}")
+    code.label(more)
+    with code.scope():
+        place = code.op("add", "i64", start, lanes)
+        row = code.intrinsic("smin", "i64", place, last)
+        inside = code.op("icmp sle", "i64", place, last, result="i1")
+        _one(code, jaxpr, inputs, outputs, [row if b else 0 for b in batched], row, inside)
+    code.jump("next")
+    code.label(done)
 
 
 def compiled(jaxpr: ClosedJaxpr, batched: Sequence[bool] = ()) -> Callable[..., list[Any]]:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..entries import NotEntryByEntry
-from .machine import has_symbol, vector_function
+from .machine import has_symbol, vector_function, vector_size
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -50,6 +50,7 @@ _OF_INTEGERS = {
 }  # fmt: skip
 _COMPARISONS = {"eq": "oeq", "ne": "une", "lt": "olt", "le": "ole", "gt": "ogt", "ge": "oge"}
 _INTRINSICS = {"sqrt": "sqrt", "abs": "fabs", "floor": "floor", "ceil": "ceil"}
+_ROOTS = {0.5: 1, 0.25: 2, 0.125: 3}
 _LIBRARY = frozenset(
     "sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp exp2 expm1 log log1p pow cbrt erf erfc atan2".split()
 )
@@ -194,11 +195,31 @@ class Instructions:
             return call(xs)
         many = vector_function(name, len(xs)) if kind == "double" else None
         if many is not None:
-            vector = self.type(kind, True)
-            function = self.function(many, vector, *[vector] * len(xs))
-            operands = ", ".join(self.operand(x, kind, True) for x in xs)
-            return self.pure(f"call {vector} {function}({operands})", kind, True)
+            return self._by_vectors(many, kind, xs)
         return self.of_lanes(kind, [call([self.lane(x, kind, k) for x in xs]) for k in range(self.width)])
+
+    def _by_vectors(self, name: str, kind: str, xs: tuple[Any, ...]) -> Value:
+        """A function for vectors of the machine's size."""
+        size = vector_size()
+        vector = f"<{size} x {kind}>"
+        function = self.function(name, vector, *[vector] * len(xs))
+        whole, out = self.type(kind, True), ""
+        for first in range(0, self.width, size):
+            lanes = f"<{size} x i32> <{', '.join(f'i32 {first + k}' for k in range(size))}>"
+            parts = [
+                self.pure(f"shufflevector {self.operand(x, kind, True)}, {whole} poison, {lanes}", kind, True) for x in xs
+            ]
+            found = self.pure(f"call {vector} {function}({', '.join(f'{vector} {x.name}' for x in parts)})", kind, True)
+            if size == self.width:
+                return found
+            places = [str(k - first) if first <= k < first + size else "poison" for k in range(self.width)]
+            wide = f"<{self.width} x i32> <{', '.join(f'i32 {k}' for k in places)}>"
+            there = self.pure(f"shufflevector {vector} {found.name}, {vector} poison, {wide}", kind, True).name
+            if out:
+                kept = ", ".join(f"i32 {k + self.width if k >= first else k}" for k in range(self.width))
+                there = self.pure(f"shufflevector {whole} {out}, {whole} {there}, <{self.width} x i32> <{kept}>", kind, True).name
+            out = there
+        return Value(out, kind, True)
 
     def any(self, x: Value) -> Value:
         """Whether a condition holds in any lane."""
@@ -309,6 +330,8 @@ class Instructions:
     def _of_float(self, name: str, x: list[Any], kind: str, params: Any) -> Value:
         if name in _INTRINSICS:
             return self.intrinsic(_INTRINSICS[name], kind, *x)
+        if name == "pow" and not isinstance(x[1], Value) and x[1] in _ROOTS:
+            return self._root(x[0], _ROOTS[x[1]], kind)
         if name in _LIBRARY:
             return self.library(name, kind, *x)
         match name:
@@ -330,6 +353,14 @@ class Instructions:
             case "nextafter":
                 return self._next_after(kind, *x)
         return self.arithmetic(name, "float64" if kind == "double" else "float32", *x)
+
+    def _root(self, x: Any, times: int, kind: str) -> Value:
+        """The square root of the square root …; of −0 and −∞ as a power has it."""
+        x = self.select(self.op("fcmp oeq", kind, x, -np.inf, result="i1"), np.inf, x, kind)
+        x = self.op("fadd", kind, x, 0.0)
+        for _ in range(times):
+            x = self.intrinsic("sqrt", kind, x)
+        return x
 
     def _next_after(self, kind: str, x: Any, y: Any) -> Value:
         integer = _BITS[kind]

@@ -8,6 +8,7 @@ have 64 bits.
 import ctypes
 import functools
 import hashlib
+import os
 import platform
 import threading
 from typing import Any
@@ -50,6 +51,7 @@ call:
 }}
 """
 _DATA_OF_BUFFER = 24
+DIMENSIONS_OF_BUFFER = 40
 
 _lock = threading.Lock()
 _engines: dict[str, Any] = {}
@@ -68,6 +70,86 @@ def buffer(array: str, k: int, name: str) -> list[str]:
         f"%{name}.data = getelementptr i8, ptr %{name}.buffer, i64 {_DATA_OF_BUFFER}",
         f"%{name} = load ptr, ptr %{name}.data",
     ]
+
+
+def alone(body: list[str]) -> list[str]:
+    """The kernel that does what `body` says of the buffers %args and %results."""
+    return ["define void @{name}.kernel(ptr %args, ptr %results) {", "entry:", *body, "ret void", "}"]
+
+
+def in_threads(body: list[str], batched: int, enough: int) -> list[str]:
+    """The same, done by as many threads as there are processors for it where the batch, the first dimension of argument
+    `batched`, is large `enough`; %taken is a counter that the threads share.
+    """
+    others = 0
+    if has_symbol("pthread_create"):
+        others = (os.cpu_count() or 1) // jax.local_device_count("cpu") - 1
+        if hasattr(os, "sched_getaffinity"):
+            others = min(others, len(os.sched_getaffinity(0)) - 1)
+    return [
+        "declare i32 @pthread_create(ptr, ptr, ptr, ptr)",
+        "declare i32 @pthread_join(i64, ptr)",
+        "define ptr @{name}.thread(ptr %shared) {",
+        "entry:",
+        "%args = load ptr, ptr %shared",
+        "%results.at = getelementptr ptr, ptr %shared, i64 1",
+        "%results = load ptr, ptr %results.at",
+        "%taken = getelementptr ptr, ptr %shared, i64 2",
+        *body,
+        "ret ptr null",
+        "}",
+        "define void @{name}.kernel(ptr %args, ptr %results) {",
+        "entry:",
+        "%shared = alloca [3 x i64]",
+        "store ptr %args, ptr %shared",
+        "%results.at = getelementptr ptr, ptr %shared, i64 1",
+        "store ptr %results, ptr %results.at",
+        "%taken = getelementptr ptr, ptr %shared, i64 2",
+        "store i64 0, ptr %taken",
+        *buffer("%args", batched, "arg"),
+        f"%dims.at = getelementptr i8, ptr %arg.buffer, i64 {DIMENSIONS_OF_BUFFER}",
+        "%dims = load ptr, ptr %dims.at",
+        "%batch = load i64, ptr %dims",
+        f"%large = icmp sge i64 %batch, {enough}",
+        *_started(max(others, 0)),
+        "call ptr @{name}.thread(ptr %shared)",
+        *_ended(max(others, 0)),
+        "ret void",
+        "}",
+    ]
+
+
+def _started(others: int) -> list[str]:
+    lines = []
+    for k in range(others):
+        lines += [
+            f"%thread{k} = alloca i64",
+            f"%error{k}.at = alloca i32",
+            f"store i32 1, ptr %error{k}.at",
+            f"br i1 %large, label %create{k}, label %created{k}",
+            f"create{k}:",
+            f"%error{k} = call i32 @pthread_create(ptr %thread{k}, ptr null, ptr @{{name}}.thread, ptr %shared)",
+            f"store i32 %error{k}, ptr %error{k}.at",
+            f"br label %created{k}",
+            f"created{k}:",
+        ]
+    return lines
+
+
+def _ended(others: int) -> list[str]:
+    lines = []
+    for k in range(others):
+        lines += [
+            f"%failed{k} = load i32, ptr %error{k}.at",
+            f"%started{k} = icmp eq i32 %failed{k}, 0",
+            f"br i1 %started{k}, label %join{k}, label %ended{k}",
+            f"join{k}:",
+            f"%handle{k} = load i64, ptr %thread{k}",
+            f"call i32 @pthread_join(i64 %handle{k}, ptr null)",
+            f"br label %ended{k}",
+            f"ended{k}:",
+        ]
+    return lines
 
 
 @functools.cache
@@ -136,6 +218,7 @@ def _compiled(text: str) -> Any:
     # Without the vectorisation of straight-line code: it gains nothing here, and LLVM 22.1 breaks some functions by it.
     tuning = llvm.create_pipeline_tuning_options(speed_level=2)
     tuning.slp_vectorization = False
+    tuning.loop_vectorization = True
     passes = llvm.create_pass_builder(machine, tuning)
     passes.getModulePassManager().run(module, passes)
     engine = llvm.create_mcjit_compiler(module, machine)

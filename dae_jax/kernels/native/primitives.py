@@ -15,7 +15,7 @@ from .memory import Memory, View, row_major
 
 
 # More entries than these are kept in memory, with loops over them.
-SMALL = 64
+SMALL = 24
 LARGE = 512
 
 CALLS = {
