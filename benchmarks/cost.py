@@ -31,9 +31,9 @@ def _gradients(repeats):
     from .peers import dae_jax_peer, problems
 
     jax.config.update("jax_enable_x64", True)
-    solve = dae_jax_peer.solution(double_pendulum(), 1e-8, 10.0, "OrthogonalProjection(DOP853)")
+    solve = dae_jax_peer.solution(double_pendulum(), 10.0, "OrthogonalProjection(DOP853)")
     start = jnp.asarray(problems.chain_start(2))
-    end = lambda start, adjoint: jnp.sum(solve(start, adjoint=adjoint).ys[0])
+    end = lambda start, adjoint: jnp.sum(solve(start, 1e-8, adjoint=adjoint, max_steps=4096).ys[0])
     forward = diffrax.ForwardMode()
     functions = {
         "plain solve": lambda s: end(s, diffrax.RecursiveCheckpointAdjoint()),

@@ -116,7 +116,9 @@ def choices(x):
         jax.lax.cond(x[0] > 1.1, jnp.sin, lambda y: y / 3, x),
         jax.lax.switch(k, [lambda y: y, lambda y: 2 * y, lambda y: (y**2).at[0].set(5.0)], x),
         jax.lax.switch(k, [lambda y: jnp.zeros(200), lambda y: jnp.arange(200) * y[0]], x),
-        jax.lax.cond(x[1] > 100, lambda y: (y, 1), lambda y: (jax.lax.cond(y[2] < -3, lambda z: -z, lambda z: z, y), 2), x),
+        jax.lax.cond(
+            x[1] > 100, lambda y: (y, 1), lambda y: (jax.lax.cond(y[2] < -3, lambda z: -z, lambda z: z, y), 2), x
+        ),
         jax.lax.select_n(k % 3, x, 2 * x, 3 * x),
     ]
 

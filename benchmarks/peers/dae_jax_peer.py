@@ -1,6 +1,7 @@
-"""This library: one jitted `daesolve`, from constraints as plain JAX functions; the sweep is `dae_jax.sweep`, on one core
-`jit(vmap(daesolve))`.
-"""
+"""This library: one jitted `daesolve`, from constraints as plain JAX functions; the sweep is `jit(vmap(daesolve))`."""
+
+import functools
+import os
 
 import numpy as np
 
@@ -24,29 +25,41 @@ def available():
 def double_pendulum(rtol, t1=10.0, method=methods[0]):
     from dae_jax.scenes import double_pendulum
 
-    return _prepare(double_pendulum(), problems.chain_start(2), rtol, t1, method)
+    return _prepare(double_pendulum, problems.chain_start(2), rtol, t1, method)
 
 
 def pendulum(rtol, t1=10.0, method=methods[0]):
     from dae_jax.scenes import pendulum
 
-    return _prepare(pendulum(), problems.chain_start(1), rtol, t1, method)
+    return _prepare(pendulum, problems.chain_start(1), rtol, t1, method)
 
 
 def chain(n, rtol, t1=1.0, method="DOP853"):
     from dae_jax.scenes import chain
 
-    return _prepare(chain(n), problems.chain_start(n), rtol, t1, method)
+    return _prepare(functools.partial(chain, n), problems.chain_start(n), rtol, t1, method)
 
 
 def sweep(angles, rtol, t1=10.0, method="OrthogonalProjection(DOP853)", threads=1):
+    import jax
+    import jax.numpy as jnp
+
     from dae_jax.scenes import double_pendulum
 
-    return _prepare(double_pendulum(), problems.double_pendulum_starts(angles), rtol, t1, method, threads)
+    starts = jnp.asarray(problems.double_pendulum_starts(angles))
+    ends = jax.jit(jax.vmap(_compiled(double_pendulum, t1, method), (0, None)))
+    solve = lambda: ends(starts, rtol).block_until_ready()
+    # A batch takes the processors that the process may use when it is compiled.
+    processors = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, sorted(processors)[:threads])
+    try:
+        return np.asarray(solve()), solve
+    finally:
+        os.sched_setaffinity(0, processors)
 
 
-def solution(scene, rtol, t1, method):
-    """A function of the start (flat, as in `problems`) that gives the `DAESolution`."""
+def solution(scene, t1, method):
+    """A function of the start (flat, as in `problems`) and the tolerance that gives the `DAESolution`."""
     import diffrax
     import jax.numpy as jnp
 
@@ -60,33 +73,33 @@ def solution(scene, rtol, t1, method):
         "StateSpace": (dae_jax.DOP853(), dae_jax.StateSpace(scene.chart) if scene.chart else None),
     }[method]
 
-    def solve(start, **options):
+    def solve(start, rtol, **options):
         return dae_jax.daesolve(
             scene.system, solver, 0.0, t1, None, tuple(jnp.split(start, 2)), scene.args, formulation=formulation,
-            stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol), max_steps=100_000, throw=False, **options
+            stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol), throw=False,
+            **{"max_steps": 100_000, **options},
         )  # fmt: skip
 
     return solve
 
 
-def _prepare(scene, start, rtol, t1, method, threads=None):
-    """`threads`: of a batch of starts; `None` for a single one."""
+@functools.cache
+def _compiled(make, t1, method):
+    """(start, tolerance) → end, of one solve: compiled once for all tolerances."""
     import jax
     import jax.numpy as jnp
 
-    import dae_jax
-
     jax.config.update("jax_enable_x64", True)
-    solve_from = solution(scene, rtol, t1, method)
-    end = lambda start: jnp.concatenate([x[-1] for x in solve_from(start).ys])
-    compiled = jax.jit(jax.vmap(end) if threads else end)
+    solve = solution(make(), t1, method)
+    return jax.jit(lambda start, rtol: jnp.concatenate([x[-1] for x in solve(start, rtol).ys]))
+
+
+def _prepare(make, start, rtol, t1, method):
+    import jax.numpy as jnp
+
+    end = _compiled(make, t1, method)
     start = jnp.asarray(start)
-
-    def solve():
-        if threads and threads > 1:
-            return dae_jax.sweep(end, start, progress=False)
-        return compiled(start).block_until_ready()
-
+    solve = lambda: end(start, rtol).block_until_ready()
     return np.asarray(solve()), solve
 
 
@@ -94,6 +107,22 @@ stiff_methods = ("RadauIIA5", "BDF", "OrthogonalProjection(DOP853)")
 
 
 def stiff(problem, rtol, method):
+    import jax
+    import jax.numpy as jnp
+
+    import dae_jax
+
+    end = _stiff(problem.scene, method)
+    start = jax.tree.map(jnp.asarray, problem.scene().y0)
+    solve = lambda: jax.block_until_ready(end(start, rtol))
+    found, result = solve()
+    if result != dae_jax.RESULTS.successful:
+        raise RuntimeError("the solve failed")
+    return np.asarray(found), solve
+
+
+@functools.cache
+def _stiff(make, method):
     import diffrax
     import jax
     import jax.numpy as jnp
@@ -101,7 +130,7 @@ def stiff(problem, rtol, method):
     import dae_jax
 
     jax.config.update("jax_enable_x64", True)
-    scene = problem.scene()
+    scene = make()
     solver = {
         "RadauIIA5": dae_jax.RadauIIA5(),
         "BDF": dae_jax.BDF(),
@@ -110,20 +139,14 @@ def stiff(problem, rtol, method):
     if scene.stiff and method.startswith("Orthogonal"):
         raise ValueError("an explicit method on a stiff problem")
 
-    @jax.jit
-    def end(start):
+    def end(start, rtol):
         sol = dae_jax.daesolve(
-            scene.system, solver, 0.0, scene.t1, None, start, max_steps=1_000_000,
-            stepsize_controller=diffrax.PIDController(rtol=rtol, atol=scene.scale * rtol), throw=False,
+            scene.system, solver, 0.0, scene.t1, None, start, max_steps=1_000_000, throw=False,
+            stepsize_controller=diffrax.PIDController(rtol=rtol, atol=scene.scale * rtol),
         )  # fmt: skip
         return jnp.concatenate([x[-1] for x in jax.tree.leaves(sol.ys)]), sol.result
 
-    start = jax.tree.map(jnp.asarray, scene.y0)
-    solve = lambda: jax.block_until_ready(end(start))
-    found, result = solve()
-    if result != dae_jax.RESULTS.successful:
-        raise RuntimeError("the solve failed")
-    return np.asarray(found), solve
+    return jax.jit(end)
 
 
 def robertson_variations(rates, rtol):

@@ -4,6 +4,8 @@ Default settings otherwise; the sweep is `jit(vmap(diffeqsolve))`. Stiff problem
 eliminated by hand.
 """
 
+import functools
+
 import numpy as np
 
 from . import missing, problems
@@ -70,13 +72,23 @@ def _mechanism_field(system):
 
 
 def _prepare(field, start, rtol, t1, method, batch=False, atol=None):
+    import jax.numpy as jnp
+
+    compiled = _compiled(field, t1, method, batch)
+    y0 = jnp.asarray(start)
+    solve = lambda: compiled(y0, rtol, atol or rtol).block_until_ready()
+    return np.asarray(solve()), solve
+
+
+@functools.cache
+def _compiled(field, t1, method, batch):
+    """(start, tolerances) → end: compiled once for all tolerances."""
     import diffrax
     import jax
-    import jax.numpy as jnp
 
     jax.config.update("jax_enable_x64", True)
 
-    def one(y0):
+    def one(y0, rtol, atol):
         sol = diffrax.diffeqsolve(
             diffrax.ODETerm(field),
             getattr(diffrax, method)(),
@@ -84,18 +96,12 @@ def _prepare(field, start, rtol, t1, method, batch=False, atol=None):
             t1=t1,
             dt0=None,
             y0=y0,
-            stepsize_controller=diffrax.PIDController(rtol=rtol, atol=atol or rtol),
+            stepsize_controller=diffrax.PIDController(rtol=rtol, atol=atol),
             max_steps=100_000,
         )
         return sol.ys[-1]
 
-    compiled = jax.jit(jax.vmap(one) if batch else one)
-    y0 = jnp.asarray(start)
-
-    def solve():
-        return compiled(y0).block_until_ready()
-
-    return np.asarray(solve()), solve
+    return jax.jit(jax.vmap(one, (0, None, None)) if batch else one)
 
 
 def _pendulum_field(t, y, args):

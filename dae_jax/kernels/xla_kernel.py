@@ -25,6 +25,7 @@ _REDUCTIONS = frozenset("reduce_sum reduce_max reduce_min reduce_prod reduce_and
 SMALL_DOT = 64
 LARGE_REDUCTION = 4096
 
+
 def hindrances(jaxpr: ClosedJaxpr | Jaxpr) -> tuple[str, ...]:
     """The names of the primitives in `jaxpr`, at any depth, that keep it from being one kernel; empty if none does."""
     return tuple(dict.fromkeys(eqn.primitive.name for eqn in equations(jaxpr) if _hinders(eqn)))

@@ -69,7 +69,9 @@ def written(jaxpr: ClosedJaxpr, batched: Sequence[bool] = ()) -> str:
         ]
         code.lines.append("call void @free(ptr %heap.raw)")
     body = [*found, *code.stack, "br label %start", "start:", *code.lines]
-    functions = machine.in_threads(body, list(batched).index(True), VECTORS * code.width) if lanes else machine.alone(body)
+    functions = (
+        machine.in_threads(body, list(batched).index(True), VECTORS * code.width) if lanes else machine.alone(body)
+    )
     return "\n".join([*code.constants, *code.declared.values(), *functions])
 
 

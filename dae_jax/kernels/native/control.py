@@ -96,7 +96,9 @@ class Control(Primitives):
         of_cond, of_body, first = args[:n], args[n : n + m], args[n + m :]
         for x in (*of_cond, *of_body):
             _refer(x, 1)
-        own = depends_in_loop(p, [list(map(has_lanes, xs)) for xs in (of_cond, of_body, first)]) if code.width > 1 else ()
+        own = (
+            depends_in_loop(p, [list(map(has_lanes, xs)) for xs in (of_cond, of_body, first)]) if code.width > 1 else ()
+        )
         avals = [v.aval for v in p["body_jaxpr"].jaxpr.invars[m:]]
         head, body, after, active = (code.name() for _ in range(4))
         carry = _Carry(self, avals, first, own)
@@ -122,7 +124,9 @@ class Control(Primitives):
         code.label(body)
         phis = carry.turn(self.run(p["body_jaxpr"], [*of_body, *carry.values]), entered, running if each else None)
         if each and running:
-            phis.append(f"%{active} = phi {code.type('i1', True)} [ {everyone}, %{entered} ], [ {running.name}, %{code.block} ]")
+            phis.append(
+                f"%{active} = phi {code.type('i1', True)} [ {everyone}, %{entered} ], [ {running.name}, %{code.block} ]"
+            )
         code.lines[here:here] = phis
         code.jump(head)
         inside.close()
@@ -168,7 +172,10 @@ class Control(Primitives):
             _refer(x, 1)
         rows: list[Any] = [None] * length
         for i in reversed(range(length)) if reverse else range(length):
-            out = self.run(inner, [*consts, *carry, *(objects(list(x[i].ravel()) if x.ndim > 1 else [x[i]], x.shape[1:]) for x in xs)])
+            out = self.run(
+                inner,
+                [*consts, *carry, *(objects(list(x[i].ravel()) if x.ndim > 1 else [x[i]], x.shape[1:]) for x in xs)],
+            )
             carry, rows[i] = out[: len(carry)], list(map(self.code.entries, out[len(carry) :]))
         for x in consts:
             _refer(x, -1)
@@ -343,7 +350,9 @@ def has_lanes(x: Any) -> bool:
     """Whether an array's entries may differ from lane to lane."""
     if isinstance(x, View):
         return x.buffer.lanes or (isinstance(x.offset, Value) and x.offset.lanes)
-    return any(isinstance(p, Value) and p.lanes for e in x.ravel() for p in (parts(e) if isinstance(e, Complex) else (e,)))
+    return any(
+        isinstance(p, Value) and p.lanes for e in x.ravel() for p in (parts(e) if isinstance(e, Complex) else (e,))
+    )
 
 
 def _parts_of(aval: Any) -> list[str]:

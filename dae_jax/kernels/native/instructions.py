@@ -182,7 +182,9 @@ class Instructions:
         suffix = kind.replace("double", "f64").replace("float", "f32")
         full = f"llvm.{name}.{f'v{self.width}' if lanes else ''}{suffix}"
         function = self.function(full, vector, *[vector] * len(xs))
-        return self.pure(f"call {vector} {function}({', '.join(self.operand(x, kind, lanes) for x in xs)})", kind, lanes)
+        return self.pure(
+            f"call {vector} {function}({', '.join(self.operand(x, kind, lanes) for x in xs)})", kind, lanes
+        )
 
     def library(self, name: str, kind: str, *xs: Any) -> Value:
         """A function of the C library, lane by lane where it has none for vectors."""
@@ -190,7 +192,9 @@ class Instructions:
         if not has_symbol(name):
             raise NotEntryByEntry(name)
         function = self.function(name, kind, *[kind] * len(xs))
-        call = lambda ys: self.pure(f"call {kind} {function}({', '.join(self.operand(y, kind) for y in ys)})", kind, False)
+        call = lambda ys: self.pure(
+            f"call {kind} {function}({', '.join(self.operand(y, kind) for y in ys)})", kind, False
+        )
         if not any(isinstance(x, Value) and x.lanes for x in xs):
             return call(xs)
         many = vector_function(name, len(xs)) if kind == "double" else None
@@ -207,7 +211,8 @@ class Instructions:
         for first in range(0, self.width, size):
             lanes = f"<{size} x i32> <{', '.join(f'i32 {first + k}' for k in range(size))}>"
             parts = [
-                self.pure(f"shufflevector {self.operand(x, kind, True)}, {whole} poison, {lanes}", kind, True) for x in xs
+                self.pure(f"shufflevector {self.operand(x, kind, True)}, {whole} poison, {lanes}", kind, True)
+                for x in xs
             ]
             found = self.pure(f"call {vector} {function}({', '.join(f'{vector} {x.name}' for x in parts)})", kind, True)
             if size == self.width:
@@ -217,7 +222,9 @@ class Instructions:
             there = self.pure(f"shufflevector {vector} {found.name}, {vector} poison, {wide}", kind, True).name
             if out:
                 kept = ", ".join(f"i32 {k + self.width if k >= first else k}" for k in range(self.width))
-                there = self.pure(f"shufflevector {whole} {out}, {whole} {there}, <{self.width} x i32> <{kept}>", kind, True).name
+                there = self.pure(
+                    f"shufflevector {whole} {out}, {whole} {there}, <{self.width} x i32> <{kept}>", kind, True
+                ).name
             out = there
         return Value(out, kind, True)
 

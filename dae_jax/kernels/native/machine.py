@@ -8,13 +8,13 @@ have 64 bits.
 import ctypes
 import functools
 import hashlib
+import importlib
 import os
 import platform
 import threading
 from typing import Any
 
 import jax
-import llvmlite.binding as llvm
 
 
 # The kernel gets the arrays of argument and result buffers. A call with an extension of type 1 asks for the version of
@@ -153,10 +153,18 @@ def _ended(others: int) -> list[str]:
 
 
 @functools.cache
-def host() -> Any:
-    """The machine that code is made for."""
+def _llvm() -> Any:
+    """LLVM, loaded when it is first needed."""
+    llvm = importlib.import_module("llvmlite.binding")
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
+    return llvm
+
+
+@functools.cache
+def host() -> Any:
+    """The machine that code is made for."""
+    llvm = _llvm()
     features = llvm.get_host_cpu_features().flatten()
     return llvm.Target.from_default_triple().create_target_machine(
         cpu=llvm.get_host_cpu_name(), features=features, opt=3, codemodel="jitdefault", jit=True
@@ -166,7 +174,7 @@ def host() -> Any:
 @functools.cache
 def vector_size() -> int:
     """How many numbers of 64 bits the host's vectors hold."""
-    features = llvm.get_host_cpu_features()
+    features = _llvm().get_host_cpu_features()
     return 8 if features.get("avx512f") else 4 if features.get("avx2") else 2
 
 
@@ -182,7 +190,7 @@ def _vector_library() -> Any:
         library = ctypes.CDLL("libmvec.so.1")
     except OSError:
         return None
-    llvm.load_library_permanently("libmvec.so.1")
+    _llvm().load_library_permanently("libmvec.so.1")
     return library
 
 
@@ -213,7 +221,7 @@ def register(module: str) -> str:
 
 
 def _compiled(text: str) -> Any:
-    machine = host()
+    machine, llvm = host(), _llvm()
     module = llvm.parse_assembly(text)
     # Without the vectorisation of straight-line code: it gains nothing here, and LLVM 22.1 breaks some functions by it.
     tuning = llvm.create_pipeline_tuning_options(speed_level=2)

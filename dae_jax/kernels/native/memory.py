@@ -87,7 +87,9 @@ class Memory(Instructions):
     def plus(self, a: Any, b: Any) -> Any:
         if isinstance(a, int) and isinstance(b, int):
             return a + b
-        return b if isinstance(a, int) and a == 0 else a if isinstance(b, int) and b == 0 else self.op("add", "i64", a, b)
+        return (
+            b if isinstance(a, int) and a == 0 else a if isinstance(b, int) and b == 0 else self.op("add", "i64", a, b)
+        )
 
     def at(self, view: View, index: Sequence[Any]) -> Any:
         """The place of an entry in the buffer."""
@@ -148,9 +150,7 @@ class Memory(Instructions):
         full = f"llvm.masked.{name}.v{self.width}{_suffix(stored)}.{f'v{self.width}' if each else ''}p0"
         function = self.function(full, "void", vector, to, mask)
         active = self.text(self.mask, "i1", True) if self.mask else "splat (i1 true)"
-        self.lines.append(
-            f"call void {function}({number}, {to} align {BYTES[stored]} {address}, {mask} {active})"
-        )
+        self.lines.append(f"call void {function}({number}, {to} align {BYTES[stored]} {address}, {mask} {active})")
 
     # Loops
 

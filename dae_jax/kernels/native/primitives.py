@@ -114,7 +114,9 @@ class Primitives(EntryByEntry):
         if name in MORE_ELEMENTWISE:
             return [self.elementwise(eqn, args)]
         if name == "unstack":
-            return [x.reshape(a.shape) for x, a in zip(np.split(args[0], len(outs), eqn.params["axis"]), outs, strict=True)]
+            return [
+                x.reshape(a.shape) for x, a in zip(np.split(args[0], len(outs), eqn.params["axis"]), outs, strict=True)
+            ]
         if name == "bitcast_convert_type":
             raise NotEntryByEntry(name)
         return super().equation(eqn, args)
@@ -122,14 +124,14 @@ class Primitives(EntryByEntry):
     def add_any(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
         if np.dtype(eqn.outvars[0].aval.dtype).kind != "c":
             return super().add_any(eqn, args)
-        return objects([self.code.apply(eqn, list(x)) for x in zip(*(a.ravel() for a in args), strict=True)], args[0].shape)
+        return objects(
+            [self.code.apply(eqn, list(x)) for x in zip(*(a.ravel() for a in args), strict=True)], args[0].shape
+        )
 
     def _updated(self, args: list[np.ndarray]) -> np.ndarray:
         x, update, *starts = args
         out = x.copy()
-        first = [
-            min(max(int(s[()]), 0), d - k) for s, d, k in zip(starts, x.shape, update.shape, strict=True)
-        ]
+        first = [min(max(int(s[()]), 0), d - k) for s, d, k in zip(starts, x.shape, update.shape, strict=True)]
         out[tuple(slice(s, s + k) for s, k in zip(first, update.shape, strict=True))] = update
         return out
 
@@ -221,7 +223,10 @@ class Primitives(EntryByEntry):
                 x = x if x.contiguous else self.code.copied(x, x.dtype)
                 strides, offset = row_major(shape), x.offset
             case "broadcast_in_dim":
-                of = {d: (0 if n == 1 else s) for d, n, s in zip(p["broadcast_dimensions"], x.shape, x.strides, strict=True)}
+                of = {
+                    d: (0 if n == 1 else s)
+                    for d, n, s in zip(p["broadcast_dimensions"], x.shape, x.strides, strict=True)
+                }
                 strides = tuple(of.get(d, 0) for d in range(len(shape)))
             case "transpose":
                 strides = tuple(x.strides[d] for d in p["permutation"])
@@ -267,7 +272,8 @@ class Primitives(EntryByEntry):
         else:
             update, p = args[2], eqn.params
             numbers, sizes = windows(out.shape, update.shape, p["dimension_numbers"])
-            place = self._places(out, self._indices(eqn, args[1], isinstance(update, View) and update.size > SMALL), numbers, sizes, p["mode"])
+            indices = self._indices(eqn, args[1], isinstance(update, View) and update.size > SMALL)
+            place = self._places(out, indices, numbers, sizes, p["mode"])
 
         def put(index: list[Any], x: Any) -> None:
             at, inside = place(index)
