@@ -22,9 +22,9 @@ from .solution import RESULTS
 from .sweep_store import Memory, Store
 
 
-# Lanes of one chunk and device. On a CPU lanes run one after another, so that a chunk only has to outweigh the 0.1 ms of
+# Lanes of one chunk and device. On a CPU lanes run a vector at a time, so that a chunk only has to outweigh the 0.1 ms of
 # its start; on an accelerator they run in step.
-LANES = {"cpu": 128}
+LANES = {"cpu": 512}
 LANES_OF_ACCELERATOR = 8192
 
 
@@ -154,7 +154,7 @@ def _batched(fn: Any, devices: tuple[Any, ...]) -> tuple[Any, NamedSharding]:
 
 
 def _run(call: Any, elements: Any, chunk: int, kept: Any, devices: list[Any], report: Callable[[], None]) -> None:
-    """All chunks of this process that are not done, several at once: what one kernel does takes one core."""
+    """All chunks of this process that are not done, several at once: what is no kernel of ours may take one core only."""
     size = jax.tree.leaves(elements)[0].shape[0]
     mine = [c for c in np.flatnonzero(~kept.done) if c % jax.process_count() == jax.process_index()]
     workers = max(len(os.sched_getaffinity(0)) // len(devices), 1) if devices[0].platform == "cpu" else 2
