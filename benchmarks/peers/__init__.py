@@ -8,6 +8,7 @@ A peer is a module with
     pendulum(rtol, t1=10.0, method)          → (end state, solve)
     chain(n, rtol, t1=1.0, method)           → (end state, solve)       where it takes part in the chain
     sweep(angles, rtol, t1=10.0, method)     → (end states, solve)      where it takes part in the sweep
+    stiff(problem, rtol, method)             → (end state, solve)       where it has `stiff_methods`, see `stiff_problems`
 The call builds and solves once; `solve()` then integrates again from the start, warm, and returns when it is done.
 The absolute tolerance equals the relative one throughout. States are as in `problems`.
 """
@@ -27,6 +28,7 @@ NAMES = (
     "sundae_peer",
     "solve_dae_peer",
     "drake_peer",
+    "jaxonomy_peer",
 )
 PACKAGES = (
     *("numpy", "scipy", "jax", "jaxlib", "diffrax", "heyoka", "casadi", "exudyn"),
