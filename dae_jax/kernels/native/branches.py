@@ -1,0 +1,103 @@
+"""Branches of jaxprs. With lanes a branch runs if any lane takes it, and a mask says which do."""
+
+from typing import Any
+
+import numpy as np
+
+from ..entries import is_number
+from .instructions import Value
+from .loops import Loops
+from .memory import View
+from .operands import has_lanes, of_texts, parts_of, texts
+from .primitives import SMALL, Primitives
+
+
+class Branches(Loops):
+    """Runs `cond`."""
+
+    def _cond(self, eqn: Any, args: list[Any]) -> list[Any]:
+        code, (which, *operands) = self.code, args
+        branches = eqn.params["branches"]
+        index = which[()]
+        if is_number(index):
+            return self.run(branches[min(max(int(index), 0), len(branches) - 1)], operands)
+        dtype, mask, last = eqn.invars[0].aval.dtype, code.mask, len(branches) - 1
+        taken = []
+        for k in range(len(branches)):
+            if np.dtype(dtype) == bool:
+                here = index if k else code.op("xor", "i1", index, np.True_)
+            else:
+                here = code.compare("le" if k == 0 else "ge" if k == last else "eq", dtype, index, dtype.type(k))
+            taken.append(code.op("and", "i1", mask, here) if mask is not None and here.lanes else here)
+        lines, before = code.lines, code.block
+        found, written, starts, ends = [], [], [], []
+        for branch, here in zip(branches, taken, strict=True):
+            code.lines = []
+            starts.append(code.name())
+            code.label(starts[-1])
+            code.mask = here if here.lanes else mask
+            with code.scope():
+                found.append(self.run(branch, operands))
+            written.append(code.lines)
+            ends.append(code.block)
+        code.lines, code.block, code.mask = lines, before, mask
+        outs = [
+            Merged(self, v.aval, list(values), any(here.lanes for here in taken))
+            for v, values in zip(eqn.outvars, zip(*found, strict=True), strict=True)
+        ]
+        for k, here in enumerate(taken):
+            after, skipped = code.name(), code.block
+            code.lines.append(f"br i1 {code.any(here).name}, label %{starts[k]}, label %{after}")
+            code.lines += written[k]
+            code.block, code.mask = ends[k], here if here.lanes else mask
+            with code.scope():
+                for out in outs:
+                    out.deliver(k, here)
+            end, code.mask = code.block, mask
+            code.jump(after)
+            code.label(after)
+            for out in outs:
+                out.join(end, skipped)
+        return [out.value() for out in outs]
+
+
+class Merged:
+    """What branches give: entries as phi nodes, large arrays in the buffer that all share or in a new one."""
+
+    def __init__(self, run: Primitives, aval: Any, values: list[Any], each: bool) -> None:
+        self.run, self.aval, self.values = run, aval, values
+        self.lanes = each or any(map(has_lanes, values))
+        self.kinds = [] if aval.size > SMALL else parts_of(aval)
+        self.texts = ["zeroinitializer" if self.lanes else "poison"] * len(self.kinds)
+        self.view: View | None = None
+        if aval.size > SMALL:
+            first = values[0]
+            shared = all(isinstance(x, View) and x.buffer is first.buffer and x.whole for x in values)
+            self.view = first if shared else run.code.new(aval.dtype, aval.shape)
+
+    def deliver(self, k: int, taken: Value) -> None:
+        """The end of a branch."""
+        code, x = self.run.code, self.values[k]
+        self.before = self.texts
+        if self.view is not None:
+            if not (isinstance(x, View) and x.buffer is self.view.buffer):
+                code.assign(self.view, x)
+            return
+        self.texts = texts(code, self.aval, code.entries(x), self.lanes)
+        if taken.lanes:
+            mask = f"{code.type('i1', True)} {taken.name}"
+            self.texts = [
+                code.write(f"select {mask}, {code.type(kind, True)} {y}, {code.type(kind, True)} {z}", kind, True).name
+                for y, z, kind in zip(self.texts, self.before, self.kinds, strict=True)
+            ]
+
+    def join(self, end: str, skipped: str) -> None:
+        """After a branch, taken or not."""
+        code = self.run.code
+        self.texts = [
+            code.write(f"phi {code.type(kind, self.lanes)} [ {x}, %{end} ], [ {y}, %{skipped} ]", kind, self.lanes).name
+            for x, y, kind in zip(self.texts, self.before, self.kinds, strict=True)
+        ]
+
+    def value(self) -> Any:
+        return of_texts(self.texts, self.aval, self.lanes) if self.view is None else self.view
