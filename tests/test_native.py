@@ -9,6 +9,7 @@ from dae_jax.kernels.entries import NotEntryByEntry
 from dae_jax.kernels.native import compiled, hindrances
 from dae_jax.kernels.native.compiler import written
 from dae_jax.kernels.native.machine import vector_size
+from dae_jax.kernels.native.refill import main_loop
 
 
 X = np.array([1.0, 2.0, -3.0])
@@ -202,3 +203,42 @@ def test_too_large():
         return x
 
     assert hindrances(jax.make_jaxpr(fn)(jnp.arange(100.0))) == ("size",)
+
+
+def stepping(x, times):
+    """A loop as a solve is: most of the work, with something before and after it, a buffer, and its own number of turns."""
+    scale = jnp.sum(jnp.sin(x)) + 2
+
+    def step(carry):
+        i, y, saved = carry
+        saved = saved.at[i % 40].set(y * times[i % times.size])
+        for _ in range(6):
+            y = 0.99 * y + 0.01 * jnp.cos(scale * x[::-1])
+        return i + 1, jax.lax.cond(y[0] > 0.7, lambda z: 0.9 * z, lambda z: z, y), saved
+
+    count, y, saved = jax.lax.while_loop(
+        lambda c: c[0] < 10 * jnp.abs(x[0]) ** 3, step, (0, x / scale, jnp.zeros((40, 3)))
+    )
+    return [count, y * scale, saved, jnp.max(saved, 0) + times[0]]
+
+
+@pytest.mark.parametrize("shared", [True, False])
+@pytest.mark.parametrize("count", [1, 5, 100])
+def test_lanes_are_refilled(shared, count):
+    """Of lanes with 0 to 3,000 turns none holds up the others, and each gets what it gets alone."""
+    random = np.random.default_rng(1)
+    xs = X * random.permutation(np.linspace(0.1, 7, count))[:, None]
+    times = np.linspace(1, 2, 30) if shared else random.uniform(1, 2, (count, 30))
+    batched = (True, not shared)
+    jaxpr = jax.make_jaxpr(stepping)(X, np.ones(30))
+    assert main_loop(jaxpr)
+    assert "ctpop" in written(jaxpr, batched)
+    found = jax.jit(compiled(jaxpr, batched))(xs, times)
+    expected = jax.jit(jax.vmap(stepping, (0, None if shared else 0)))(xs, times)
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
+
+
+def test_a_loop_that_is_little_of_the_work_is_not_taken_apart():
+    assert main_loop(jax.make_jaxpr(flat(elementary))(X)) == ()
+    assert main_loop(jax.make_jaxpr(flat(loops))(X)) == ()

@@ -1,5 +1,6 @@
 """A jaxpr as one function in the machine's code: for one element, or for a batch whose elements are lanes of vectors."""
 
+import contextlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -7,12 +8,14 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
+from ..entries import NotEntryByEntry
 from ..jaxprs import equations
 from . import machine
 from .control import KNOWN, Control
 from .instructions import KINDS, Value, kind_of
 from .memory import Buffer, Memory, View, row_major
 from .primitives import LARGE, SMALL
+from .refill import Refilled, main_loop
 
 
 # More instructions than these take longer to compile than they save.
@@ -45,83 +48,101 @@ def written(jaxpr: ClosedJaxpr, batched: Sequence[bool] = ()) -> str:
     With `batched` inputs the function is that of a batch: these inputs, and all outputs, have a leading axis of any
     length. Raises `NotEntryByEntry` for what cannot be written.
     """
-    lanes = any(batched)
-    code = Memory(machine.vector_size() if lanes else 1)
-    code.block = "start"
-    ins, outs = jaxpr.jaxpr.invars, jaxpr.jaxpr.outvars
-    inputs = [(v.aval, Buffer(f"%arg{k}", kind_of(v.aval.dtype), False, False)) for k, v in enumerate(ins)]
-    outputs = [(v.aval, Buffer(f"%result{k}", kind_of(v.aval.dtype), False)) for k, v in enumerate(outs)]
-    if lanes:
-        _batch(code, jaxpr, inputs, outputs, batched)
-    else:
-        _one(code, jaxpr, inputs, outputs, [0] * len(inputs), 0)
-    found = [line for k in range(len(ins)) for line in machine.buffer("%args", k, f"arg{k}")]
-    found += [line for k in range(len(outs)) for line in machine.buffer("%results", k, f"result{k}")]
-    if code.heap:
-        code.function("malloc", "ptr", "i64")
-        code.function("free", "void", "ptr")
-        found += [
-            f"%heap.raw = call ptr @malloc(i64 {code.heap + 64})",
-            "%heap.int = ptrtoint ptr %heap.raw to i64",
-            "%heap.up = add i64 %heap.int, 63",
-            "%heap.aligned = and i64 %heap.up, -64",
-            "%heap = inttoptr i64 %heap.aligned to ptr",
+    path = main_loop(jaxpr) if any(batched) else ()
+    if path:
+        with contextlib.suppress(NotEntryByEntry):
+            return _Module(jaxpr, batched).text(path)
+    return _Module(jaxpr, batched).text(())
+
+
+class _Module:
+    def __init__(self, jaxpr: ClosedJaxpr, batched: Sequence[bool]) -> None:
+        self.jaxpr, self.batched = jaxpr, list(batched) or [False] * len(jaxpr.jaxpr.invars)
+        self.code = Memory(machine.vector_size() if any(batched) else 1)
+        self.run = Control(self.code, LIMIT)
+
+    def text(self, path: tuple[int, ...]) -> str:
+        """The module's text; `path`: where the main loop is, if lanes shall be refilled."""
+        code, lanes = self.code, any(self.batched)
+        ins, outs = self.jaxpr.jaxpr.invars, self.jaxpr.jaxpr.outvars
+        code.block = "start"
+        if lanes:
+            self._batch(path)
+        else:
+            self._store(self.run.run(self.jaxpr, self._arguments(None)), None, None)
+        found = [line for k in range(len(ins)) for line in machine.buffer("%args", k, f"arg{k}")]
+        found += [line for k in range(len(outs)) for line in machine.buffer("%results", k, f"result{k}")]
+        if code.heap:
+            code.function("malloc", "ptr", "i64")
+            code.function("free", "void", "ptr")
+            found += [
+                f"%heap.raw = call ptr @malloc(i64 {code.heap + 64})",
+                "%heap.int = ptrtoint ptr %heap.raw to i64",
+                "%heap.up = add i64 %heap.int, 63",
+                "%heap.aligned = and i64 %heap.up, -64",
+                "%heap = inttoptr i64 %heap.aligned to ptr",
+            ]
+            code.lines.append("call void @free(ptr %heap.raw)")
+        body = [*found, *code.stack, "br label %start", "start:", *code.lines]
+        enough = VECTORS * code.width
+        functions = machine.in_threads(body, self.batched.index(True), enough) if lanes else machine.alone(body)
+        return "\n".join([*code.constants, *code.declared.values(), *functions])
+
+    def _arguments(self, row: Value | None) -> list[Any]:
+        """The arguments, of the element that each lane has."""
+        args = []
+        for k, (v, batched) in enumerate(zip(self.jaxpr.jaxpr.invars, self.batched, strict=True)):
+            x = self._view(f"%arg{k}", v.aval, row if batched else None, writable=False)
+            args.append(x if x.size > SMALL else self.code.entries(x))
+        return args
+
+    def _store(self, results: list[Any], row: Value | None, mask: Value | None) -> None:
+        """Stores the results of the element that each lane has, in the lanes of the mask."""
+        code = self.code
+        before, code.mask = code.mask, mask
+        for k, (v, x) in enumerate(zip(self.jaxpr.jaxpr.outvars, results, strict=True)):
+            to = self._view(f"%result{k}", v.aval, row, writable=True)
+            if isinstance(x, View) and x.size > SMALL:
+                code.assign(to, x)
+                continue
+            for index in np.ndindex(v.aval.shape):
+                code.store(to.buffer, code.at(to, index), code.entry(x, index))
+        code.mask = before
+
+    def _view(self, pointer: str, aval: Any, row: Value | None, writable: bool) -> View:
+        buffer = Buffer(pointer, kind_of(aval.dtype), False, writable)
+        place = 0 if row is None else self.code.times(row, aval.size)
+        return View(buffer, np.dtype(aval.dtype), aval.shape, row_major(aval.shape), place)
+
+    def _batch(self, path: tuple[int, ...]) -> None:
+        """All elements that this thread gets: threads take them from a counter, as they get on."""
+        code, width = self.code, self.code.width
+        size, last = Value("%batch", "i64"), Value("%batch.last", "i64")
+        code.stack += [
+            f"%dims.at = getelementptr i8, ptr %arg{self.batched.index(True)}.buffer, i64 {machine.DIMENSIONS_OF_BUFFER}",
+            "%dims = load ptr, ptr %dims.at",
+            f"{size.name} = load i64, ptr %dims",
+            f"{last.name} = sub i64 {size.name}, 1",
         ]
-        code.lines.append("call void @free(ptr %heap.raw)")
-    body = [*found, *code.stack, "br label %start", "start:", *code.lines]
-    functions = (
-        machine.in_threads(body, list(batched).index(True), VECTORS * code.width) if lanes else machine.alone(body)
-    )
-    return "\n".join([*code.constants, *code.declared.values(), *functions])
-
-
-def _one(
-    code: Memory, jaxpr: ClosedJaxpr, inputs: Any, outputs: Any, rows: list[Any], row: Any, mask: Value | None = None
-) -> None:
-    args = []
-    for (aval, buffer), at in zip(inputs, rows, strict=True):
-        x = View(buffer, np.dtype(aval.dtype), aval.shape, row_major(aval.shape), code.times(at, aval.size))
-        args.append(x if x.size > SMALL else code.entries(x))
-    results = Control(code, LIMIT).run(jaxpr, args)
-    code.mask = mask
-    for (aval, buffer), x in zip(outputs, results, strict=True):
-        place = code.times(row, aval.size)
-        to = View(buffer, np.dtype(aval.dtype), aval.shape, row_major(aval.shape), place)
-        if isinstance(x, View) and x.size > SMALL:
-            code.assign(to, x)
-            continue
-        for index in np.ndindex(aval.shape):
-            code.store(buffer, code.at(to, index), code.entry(x, index))
-    code.mask = None
-
-
-def _batch(code: Memory, jaxpr: ClosedJaxpr, inputs: Any, outputs: Any, batched: Sequence[bool]) -> None:
-    """Vectors of lanes, one after another; the lanes that the last one has too many repeat the last element."""
-    first, width = list(batched).index(True), code.width
-    size, last = Value("%batch", "i64"), Value("%batch.last", "i64")
-    code.stack += [
-        f"%dims.at = getelementptr i8, ptr %arg{first}.buffer, i64 {machine.DIMENSIONS_OF_BUFFER}",
-        "%dims = load ptr, ptr %dims.at",
-        f"{size.name} = load i64, ptr %dims",
-        f"{last.name} = sub i64 {size.name}, 1",
-    ]
-    lanes = Value("<" + ", ".join(f"i64 {k}" for k in range(width)) + ">", "i64", True)
-    more, done = code.name(), code.name()
-    code.jump("next")
-    code.label("next")
-    # Threads take vectors as they get on.
-    taken = code.write("atomicrmw add ptr %taken, i64 1 monotonic", "i64", False)
-    start = code.op("mul", "i64", taken, width)
-    left = code.op("icmp slt", "i64", start, size, result="i1")
-    code.lines.append(f"br i1 {left.name}, label %{more}, label %{done}")
-    code.label(more)
-    with code.scope():
-        place = code.op("add", "i64", start, lanes)
-        row = code.intrinsic("smin", "i64", place, last)
-        inside = code.op("icmp sle", "i64", place, last, result="i1")
-        _one(code, jaxpr, inputs, outputs, [row if b else 0 for b in batched], row, inside)
-    code.jump("next")
-    code.label(done)
+        if path:
+            Refilled(code, self.run, self._arguments, self._store, size, last).write(self.jaxpr, path)
+            return
+        # A vector of elements at a time; the lanes that the last one has too many repeat the last element.
+        lanes = Value("<" + ", ".join(f"i64 {k}" for k in range(width)) + ">", "i64", True)
+        more, done = code.name(), code.name()
+        code.jump("next")
+        code.label("next")
+        start = code.write(f"atomicrmw add ptr %taken, i64 {width} monotonic", "i64", False)
+        left = code.op("icmp slt", "i64", start, size, result="i1")
+        code.lines.append(f"br i1 {left.name}, label %{more}, label %{done}")
+        code.label(more)
+        with code.scope():
+            place = code.op("add", "i64", start, lanes)
+            row = code.intrinsic("smin", "i64", place, last)
+            inside = code.op("icmp sle", "i64", place, last, result="i1")
+            self._store(self.run.run(self.jaxpr, self._arguments(row)), row, inside)
+        code.jump("next")
+        code.label(done)
 
 
 def compiled(jaxpr: ClosedJaxpr, batched: Sequence[bool] = ()) -> Callable[..., list[Any]]:

@@ -388,8 +388,10 @@ class Instructions:
         """A value in any case."""
         return x if isinstance(x, Value) else Value(self.text(x, kind), kind)
 
-    def cast(self, code: str, x: Value, kind: str) -> Value:
-        return self.pure(f"{code} {self.type(x.kind, x.lanes)} {x.name} to {self.type(kind, x.lanes)}", kind, x.lanes)
+    def cast(self, code: str, x: Value, kind: str, joined: bool = False) -> Value:
+        """A number as one of another type; `joined`: the bits of all lanes as one number."""
+        lanes = x.lanes and not joined
+        return self.pure(f"{code} {self.type(x.kind, x.lanes)} {x.name} to {self.type(kind, lanes)}", kind, lanes)
 
     def convert(self, x: Any, dtype: np.dtype, to: np.dtype) -> Any:
         if to.kind == "c":

@@ -1,0 +1,242 @@
+"""Batches whose lanes take a new element as soon as they are done with one.
+
+The main loop of a function is taken apart from what comes before and after it. A lane that has left the loop waits until
+what the waiting lanes have cost is worth an exchange: what comes after the loop, for them; then the next elements, and
+what comes before the loop. So a lane with many steps does not hold up the others.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from jax.extend.core import ClosedJaxpr
+
+from ..entries import NotEntryByEntry, objects
+from ..jaxprs import equations, equations_in
+from .control import Control, called_by
+from .frame import Frame
+from .instructions import Complex, Value
+from .memory import Memory, View
+from .operands import of_texts, parts_of, refer, texts
+from .primitives import CALLS, SMALL
+
+
+# What an exchange costs, in turns of the loop of all lanes.
+PATIENCE = 2
+
+
+def main_loop(jaxpr: ClosedJaxpr) -> tuple[int, ...]:
+    """Where the loop is that does most of the work: the place of its equation, after those of the calls around it.
+
+    Empty where no loop has more than half of the equations.
+    """
+    path: list[int] = []
+    total = sum(1 for _ in equations(jaxpr))
+    while True:
+        sizes = [sum(1 for _ in equations_in(eqn)) for eqn in jaxpr.jaxpr.eqns]
+        if max(sizes, default=0) <= total / 2:
+            return ()
+        path.append(int(np.argmax(sizes)))
+        eqn = jaxpr.jaxpr.eqns[path[-1]]
+        if eqn.primitive.name == "while":
+            return tuple(path)
+        if eqn.primitive.name not in CALLS:
+            return ()
+        jaxpr = called_by(eqn)
+
+
+class Refilled:
+    """The loop over all elements of a batch, by one thread.
+
+    `arguments(row)` gives a function's arguments for the element of each lane, `put(results, row, mask)` stores its
+    results; `size` is the number of elements, `last` the last one. Elements are taken from the counter %taken.
+    """
+
+    def __init__(
+        self,
+        code: Memory,
+        run: Control,
+        arguments: Callable[[Value], list[Any]],
+        put: Callable[[list[Any], Value, Value], None],
+        size: Value,
+        last: Value,
+    ) -> None:
+        self.code, self.run, self.arguments, self.put, self.size, self.last = code, run, arguments, put, size, last
+        # (name, LLVM type, operand at the entry, after an exchange, after a turn) of each phi node.
+        self.phis: list[list[str]] = []
+
+    def write(self, jaxpr: ClosedJaxpr, path: tuple[int, ...]) -> None:
+        """Writes the loop."""
+        code = self.code
+        head, exchange, onwards, body, done = (code.name() for _ in range(5))
+        vector = code.type("i64", True)
+        row = Value(self._phi(vector, "splat (i64 -1)"), "i64", True)
+        idle = Value(self._phi("i64", "0"), "i64")
+        self.free = Value(f"%{code.name()}", "i1", True)
+        entered = code.block
+        code.jump(head)
+
+        # The exchange is written first, since it shows what there is to keep; it comes after the head.
+        before, code.lines = code.lines, []
+        code.label(exchange)
+        with code.scope():
+            p, consts = self._exchange(jaxpr, path, row)
+            self.phis[1][3] = "0"
+            exchanged = code.block
+            code.jump(head)
+        exchange_lines, code.lines = code.lines, before
+
+        code.label(head)
+        here = len(code.lines)
+        with code.scope():
+            n = p["cond_nconsts"]
+            alive = code.op("icmp ult", "i64", row, self.size, result="i1")
+            code.mask = alive
+            for x in (*consts, *self.carry):
+                refer(x, 1)
+            (goes_on,) = self.run.run(p["cond_jaxpr"], [*consts[:n], *self.carry])
+            for x in self.carry:
+                refer(x, -1)
+            going = code.op("and", "i1", alive, code.in_lanes(code.copy(goes_on[()], "i1")))
+            code.lines.append(f"{self.free.name} = xor {code.type('i1', True)} {going.name}, splat (i1 true)")
+            finished = code.op("and", "i1", alive, self.free)
+            bits = code.cast("bitcast", finished, f"i{code.width}", True)
+            waiting = code.cast("zext", code.intrinsic("ctpop", f"i{code.width}", bits), "i64")
+            idled = code.op("add", "i64", idle, waiting)
+            some, none = code.any(going), code.op("xor", "i1", code.any(going), np.True_)
+            impatient = code.op("icmp sge", "i64", idled, PATIENCE * code.width, result="i1")
+            due = code.op("and", "i1", code.any(finished), code.op("or", "i1", none, impatient))
+            fresh = code.op("icmp eq", "i64", code.lane(row, "i64", 0), -1, result="i1")
+            now = code.op("or", "i1", fresh, due)
+            code.lines.append(f"br i1 {now.name}, label %{exchange}, label %{onwards}")
+            code.label(onwards)
+            code.lines.append(f"br i1 {some.name}, label %{body}, label %{done}")
+            code.label(body)
+            code.mask = going
+            out = self.run.run(p["body_jaxpr"], [*consts[n:], *self.carry])
+            self._turn(out, going)
+            self.phis[1][4] = idled.name
+            for x in consts:
+                refer(x, -1)
+            end = code.block
+            code.jump(head)
+        code.lines[here:here] = [
+            f"{name} = phi {kind} [ {a}, %{entered} ], [ {b or name}, %{exchanged} ], [ {c or name}, %{end} ]"
+            for name, kind, a, b, c in self.phis
+        ]
+        code.lines += exchange_lines
+        code.label(done)
+        code.mask = None
+
+    def _phi(self, kind: str, first: str) -> str:
+        """A phi node; it keeps its value where nothing else is said."""
+        self.phis.append([f"%{self.code.name()}", kind, first, "", ""])
+        return self.phis[-1][0]
+
+    def _exchange(self, jaxpr: ClosedJaxpr, path: tuple[int, ...], row: Value) -> tuple[Any, list[Any]]:
+        code, free = self.code, self.free
+        following = code.select(free, self._next(), row, "i64")
+        self.phis[0][3] = following.name
+        frames, values = [], self.arguments(code.intrinsic("smin", "i64", following, self.last))
+        for place in path:
+            frames.append(Frame(self.run, jaxpr, values))
+            frames[-1].advance(0, place)
+            values = frames[-1].operands(place)
+            eqn = frames[-1].jaxpr.eqns[place]
+            jaxpr = called_by(eqn) if eqn.primitive.name in CALLS else jaxpr
+        p = eqn.params
+        count = p["cond_nconsts"] + p["body_nconsts"]
+        first, self.avals = values[count:], [v.aval for v in eqn.outvars]
+        self.carry = [self._carried(aval) for aval in self.avals]
+        new: list[tuple[Any, Any]] = []
+        consts = [self._kept(x, new) for x in values[:count]]
+        for frame in frames:
+            frame.values = {v: self._kept(x, new) for v, x in frame.values.items()}
+
+        # What comes after the loop, in the lanes that are done with it.
+        alive = code.op("icmp ult", "i64", row, self.size, result="i1")
+        code.mask = code.op("and", "i1", free, alive)
+        out = self.carry
+        for frame, place in zip(reversed(frames), reversed(path), strict=True):
+            frame.give(place, out)
+            frame.advance(place + 1, len(frame.jaxpr.eqns))
+            out = frame.results()
+        self.put(out, row, code.op("and", "i1", free, alive))
+
+        code.mask = free
+        for phi, x in new:
+            phi[3] = x.name if not x.lanes else code.select(free, x, Value(phi[0], x.kind, True), x.kind).name
+        self._replace(first, free, 3)
+        code.mask = None
+        return p, consts
+
+    def _next(self) -> Value:
+        """The next element for each free lane: the counter, and a free lane's place among the free ones."""
+        code, width = self.code, self.code.width
+        one = code.cast("zext", self.free, "i64")
+        total, step = one, 1
+        while step < width:
+            lanes = ", ".join(f"i32 {k - step if k >= step else width}" for k in range(width))
+            vector = code.type("i64", True)
+            moved = code.pure(
+                f"shufflevector {vector} {total.name}, {vector} zeroinitializer, <{width} x i32> <{lanes}>", "i64", True
+            )
+            total, step = code.op("add", "i64", total, moved), 2 * step
+        count = code.lane(total, "i64", width - 1)
+        start = code.write(f"atomicrmw add ptr %taken, i64 {count.name} monotonic", "i64", False)
+        return code.op("add", "i64", code.op("sub", "i64", total, one), start)
+
+    def _carried(self, aval: Any) -> Any:
+        """What the loop carries: entries as phi nodes, large arrays in a buffer of the loop's own."""
+        code = self.code
+        if aval.size > SMALL:
+            return code.new(aval.dtype, aval.shape)
+        names = [self._phi(code.type(kind, True), "zeroinitializer") for kind in parts_of(aval)]
+        return of_texts(names, aval, True)
+
+    def _kept(self, x: Any, new: list[tuple[Any, Any]]) -> Any:
+        """A value from before the loop that is needed later."""
+        if isinstance(x, View):
+            if x.buffer.lanes:
+                raise NotEntryByEntry("a large array from before the loop")
+            return dataclasses.replace(x, offset=self._kept_part(x.offset, new))
+        entries = [
+            Complex(self._kept_part(e.real, new), self._kept_part(e.imag, new))
+            if isinstance(e, Complex)
+            else self._kept_part(e, new)
+            for e in x.ravel()
+        ]
+        return objects(entries, x.shape)
+
+    def _kept_part(self, x: Any, new: list[tuple[Any, Any]]) -> Any:
+        if not isinstance(x, Value):
+            return x
+        code = self.code
+        name = self._phi(code.type(x.kind, x.lanes), "zeroinitializer" if x.lanes else code.text(0, x.kind))
+        new.append((self.phis[-1], x))
+        return Value(name, x.kind, x.lanes)
+
+    def _turn(self, out: list[Any], going: Value) -> None:
+        held = {x.buffer for x in self.carry if isinstance(x, View)}
+        moved = lambda x, own: isinstance(x, View) and x.buffer in held and not (x.buffer is own.buffer and x.whole)
+        out = [
+            self.code.copied(x, a.dtype) if isinstance(own, View) and moved(x, own) else x
+            for x, own, a in zip(out, self.carry, self.avals, strict=True)
+        ]
+        self._replace(out, going, 4)
+
+    def _replace(self, values: list[Any], mask: Value, edge: int) -> None:
+        """What is carried, replaced in some lanes."""
+        code = self.code
+        phis = {phi[0]: phi for phi in self.phis}
+        for aval, x, own in zip(self.avals, values, self.carry, strict=True):
+            if isinstance(own, View):
+                if not (isinstance(x, View) and x.buffer is own.buffer):
+                    code.assign(own, x)
+                continue
+            names = texts(code, aval, own, True)
+            for name, y, kind in zip(names, texts(code, aval, code.entries(x), True), parts_of(aval), strict=True):
+                vector = code.type(kind, True)
+                chosen = f"select {code.type('i1', True)} {mask.name}, {vector} {y}, {vector} {name}"
+                phis[name][edge] = name if y == name else code.pure(chosen, kind, True).name
