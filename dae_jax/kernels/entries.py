@@ -28,7 +28,7 @@ STRUCTURAL = frozenset(
     "reduce_sum reshape rev slice split squeeze stack stop_gradient transpose".split()
 )
 _SCATTERS = {"scatter": None, "scatter-add": "total"}
-_CALLS = {
+CALLS = {
     "closed_call": "call_jaxpr",
     "jit": "jaxpr",
     "pjit": "jaxpr",
@@ -123,8 +123,8 @@ class EntryByEntry:
             sizes.append(sizes[0] * int(np.prod([args[0].shape[i] for i in eqn.params["dimension_numbers"][0][0]])))
         if max(sizes, default=0) > self.limit:
             raise NotEntryByEntry
-        if name in _CALLS:
-            inner = params[_CALLS[name]]
+        if name in CALLS:
+            inner = params[CALLS[name]]
             if not isinstance(inner, ClosedJaxpr):
                 inner = ClosedJaxpr(inner, ())
             return self.run(inner, args)

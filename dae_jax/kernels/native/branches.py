@@ -5,11 +5,12 @@ from typing import Any
 import numpy as np
 
 from ..entries import is_number
+from .in_memory import SMALL
 from .instructions import Value
 from .loops import Loops
 from .memory import View
 from .operands import has_lanes, of_texts, parts_of, texts
-from .primitives import SMALL, Primitives
+from .primitives import Primitives
 
 
 class Branches(Loops):

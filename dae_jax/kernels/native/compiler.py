@@ -12,9 +12,9 @@ from ..entries import NotEntryByEntry
 from ..jaxprs import equations
 from . import machine
 from .control import KNOWN, Control
+from .in_memory import LARGE, SMALL
 from .instructions import KINDS, Value, kind_of
 from .memory import Buffer, Memory, View, row_major
-from .primitives import LARGE, SMALL
 from .refill import Refilled, main_loop
 
 

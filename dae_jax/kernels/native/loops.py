@@ -9,10 +9,11 @@ from jax.extend.core import ClosedJaxpr
 from ..entries import objects
 from ..jaxprs import equations
 from .dependence import depends_in_loop, depends_in_scan
+from .in_memory import LARGE, SMALL
 from .instructions import Value
-from .memory import View
+from .memory import Memory, View
 from .operands import has_lanes, of_texts, parts_of, refer, texts
-from .primitives import LARGE, SMALL, Primitives
+from .primitives import Primitives
 
 
 # A loop of a known number of turns is written out if that takes no more equations than these.
@@ -140,11 +141,7 @@ class Carry:
     def turn(self, new: list[Any], entered: str, mask: Value | None) -> list[str]:
         """The end of a turn; gives the phi nodes at its beginning."""
         code, phis = self.run.code, []
-        # A buffer may hold what another one gets.
-        new = [
-            code.copied(x, a.dtype) if isinstance(own, View) and self._moves(x, own) else x
-            for x, own, a in zip(new, self.values, self.avals, strict=True)
-        ]
+        new = set_apart(code, new, self.values, self.avals)
         following = []
         for aval, x, own, names, each in zip(self.avals, new, self.values, self.names, self.lanes, strict=True):
             if isinstance(own, View):
@@ -171,6 +168,15 @@ class Carry:
                 phis.append(f"{name} = phi {vector} [ {x}, %{entered} ], [ {y}, %{code.block} ]")
         return phis
 
-    def _moves(self, x: Any, own: View) -> bool:
-        held = {v.buffer for v in self.values if isinstance(v, View)}
+
+def set_apart(code: Memory, new: list[Any], carry: list[Any], avals: list[Any]) -> list[Any]:
+    """What a turn gives, copied where it lies in a buffer of the loop's that gets something else."""
+    held = {x.buffer for x in carry if isinstance(x, View)}
+
+    def overwritten(x: Any, own: Any) -> bool:
         return isinstance(x, View) and x.buffer in held and not (x.buffer is own.buffer and x.whole)
+
+    return [
+        code.copied(x, aval.dtype) if isinstance(own, View) and overwritten(x, own) else x
+        for x, own, aval in zip(new, carry, avals, strict=True)
+    ]

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from ..entries import NotEntryByEntry, objects
-from .instructions import BYTES, Complex, Instructions, Value, kind_of
+from .arithmetic import Arithmetic
+from .instructions import BYTES, Complex, Value, kind_of
 
 
 # Bytes of a buffer that the stack holds; larger ones are taken from the heap, all at once.
@@ -64,7 +65,7 @@ def row_major(shape: Sequence[int]) -> tuple[int, ...]:
     return tuple(math.prod(shape[i + 1 :]) for i in range(len(shape)))
 
 
-class Memory(Instructions):
+class Memory(Arithmetic):
     """Instructions with arrays in memory."""
 
     def __init__(self, width: int = 1) -> None:

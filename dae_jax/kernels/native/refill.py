@@ -16,10 +16,12 @@ from ..entries import NotEntryByEntry, objects
 from ..jaxprs import equations, equations_in
 from .control import Control, called_by
 from .frame import Frame
+from .in_memory import SMALL
 from .instructions import Complex, Value
+from .loops import set_apart
 from .memory import Memory, View
 from .operands import of_texts, parts_of, refer, texts
-from .primitives import CALLS, SMALL
+from .primitives import CALLS
 
 
 # What an exchange costs, in turns of the loop of all lanes.
@@ -115,7 +117,7 @@ class Refilled:
             code.label(body)
             code.mask = going
             out = self.run.run(p["body_jaxpr"], [*consts[n:], *self.carry])
-            self._turn(out, going)
+            self._replace(set_apart(code, out, self.carry, self.avals), going, 4)
             self.phis[1][4] = idled.name
             for x in consts:
                 refer(x, -1)
@@ -216,15 +218,6 @@ class Refilled:
         name = self._phi(code.type(x.kind, x.lanes), "zeroinitializer" if x.lanes else code.text(0, x.kind))
         new.append((self.phis[-1], x))
         return Value(name, x.kind, x.lanes)
-
-    def _turn(self, out: list[Any], going: Value) -> None:
-        held = {x.buffer for x in self.carry if isinstance(x, View)}
-        moved = lambda x, own: isinstance(x, View) and x.buffer in held and not (x.buffer is own.buffer and x.whole)
-        out = [
-            self.code.copied(x, a.dtype) if isinstance(own, View) and moved(x, own) else x
-            for x, own, a in zip(out, self.carry, self.avals, strict=True)
-        ]
-        self._replace(out, going, 4)
 
     def _replace(self, values: list[Any], mask: Value, edge: int) -> None:
         """What is carried, replaced in some lanes."""
