@@ -11,6 +11,7 @@ import pytest
 
 import dae_jax
 from dae_jax.kernels import configure, hindrances, one_kernel, polynomials, scalarise, subroutine
+from dae_jax.kernels.entries import NotEntryByEntry
 from dae_jax.kernels.native import machine
 
 
@@ -343,6 +344,18 @@ class TestOneKernel:
         fused = one_kernel(two_results, "reverse")
         grad = jax.grad(lambda x: jnp.sum(fused({"x": x, "n": jnp.array(3)})["y"]))(X)
         close(grad, jax.grad(lambda x: jnp.sum(loop(x)))(X))
+
+
+def test_what_our_compiler_gives_up_is_left_to_xla(monkeypatch):
+    def gives_up(*_):
+        raise NotEntryByEntry("LLVM: broken")
+
+    monkeypatch.setattr(machine, "_compiled", gives_up)
+    fused = one_kernel(lambda x: loop(x) + 0.125, "forward")
+    assert is_marked(fused, X)
+    close(jax.jit(fused)(X), loop(X) + 0.125)
+    xs = jnp.stack([X, 2 * X])
+    close(jax.jit(jax.vmap(fused))(xs), jax.vmap(loop)(xs) + 0.125)
 
 
 class TestProcessWide:

@@ -20,6 +20,8 @@ from .refill import Refilled, main_loop
 
 # More instructions than these take longer to compile than they save.
 LIMIT = 60_000
+# Bytes of memory that a function may take for its arrays, all lanes of a vector together.
+HEAP = 2**30
 # Fewer vectors than these are not worth the 20 µs that it takes to start a thread.
 VECTORS = 4
 
@@ -72,6 +74,8 @@ class _Module:
             self._store(self.run.run(self.jaxpr, self._arguments(None)), None, None)
         found = [line for k in range(len(ins)) for line in machine.buffer("%args", k, f"arg{k}")]
         found += [line for k in range(len(outs)) for line in machine.buffer("%results", k, f"result{k}")]
+        if code.heap > HEAP:
+            raise NotEntryByEntry("arrays that are too large")
         if code.heap:
             code.function("malloc", "ptr", "i64")
             code.function("free", "void", "ptr")

@@ -16,6 +16,8 @@ from typing import Any
 
 import jax
 
+from ..entries import NotEntryByEntry
+
 
 # The kernel gets the arrays of argument and result buffers. A call with an extension of type 1 asks for the version of
 # the interface: the answer is that of the caller, since nothing but these offsets is used of it.
@@ -222,13 +224,17 @@ def register(module: str) -> str:
 
 def _compiled(text: str) -> Any:
     machine, llvm = host(), _llvm()
-    module = llvm.parse_assembly(text)
     # Without the vectorisation of straight-line code: it gains nothing here, and LLVM 22.1 breaks some functions by it.
     tuning = llvm.create_pipeline_tuning_options(speed_level=2)
     tuning.slp_vectorization = False
     tuning.loop_vectorization = True
     passes = llvm.create_pass_builder(machine, tuning)
-    passes.getModulePassManager().run(module, passes)
+    try:
+        module = llvm.parse_assembly(text)
+        passes.getModulePassManager().run(module, passes)
+        module.verify()
+    except RuntimeError as error:  # what LLVM would end the process for
+        raise NotEntryByEntry(f"LLVM: {error}") from error
     engine = llvm.create_mcjit_compiler(module, machine)
     engine.finalize_object()
     return engine
