@@ -98,7 +98,7 @@ def _prepare(make, start, rtol, t1, method):
     import jax.numpy as jnp
 
     end = _compiled(make, t1, method)
-    start = jnp.asarray(start)
+    start, rtol = jnp.asarray(start), jnp.asarray(rtol)
     solve = lambda: end(start, rtol).block_until_ready()
     return np.asarray(solve()), solve
 
@@ -113,7 +113,7 @@ def stiff(problem, rtol, method):
     import dae_jax
 
     end = _stiff(problem.scene, method)
-    start = jax.tree.map(jnp.asarray, problem.scene().y0)
+    start, rtol = jax.tree.map(jnp.asarray, (problem.scene().y0, rtol))
     solve = lambda: jax.block_until_ready(end(start, rtol))
     found, result = solve()
     if result != dae_jax.RESULTS.successful:

@@ -75,8 +75,8 @@ def _prepare(field, start, rtol, t1, method, batch=False, atol=None):
     import jax.numpy as jnp
 
     compiled = _compiled(field, t1, method, batch)
-    y0 = jnp.asarray(start)
-    solve = lambda: compiled(y0, rtol, atol or rtol).block_until_ready()
+    y0, rtol, atol = jnp.asarray(start), jnp.asarray(rtol), jnp.asarray(atol or rtol)
+    solve = lambda: compiled(y0, rtol, atol).block_until_ready()
     return np.asarray(solve()), solve
 
 
