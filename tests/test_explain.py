@@ -10,6 +10,7 @@ import pytest
 
 import dae_jax
 from dae_jax.scenes import SCENES, chain
+from tests.methods import METHODS
 
 
 MECHANISMS = [name for name in SCENES if isinstance(SCENES[name]().system, dae_jax.ConstrainedSystem)]
@@ -25,6 +26,12 @@ def test_every_scene_is_one_kernel(name):
     found = plan(SCENES[name]())
     assert found.one_kernel, found.hindrances
     assert found.hindrances == ()
+
+
+@pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
+def test_every_method_is_one_kernel(method):
+    found = plan(SCENES["pendulum"](), method.solver, formulation=method.formulation)
+    assert found.one_kernel, found.hindrances
 
 
 def test_names_the_primitive_that_prevents_it():

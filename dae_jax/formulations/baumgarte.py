@@ -44,9 +44,14 @@ class Baumgarte(AbstractFormulation):
 
     def __call__(self, *levels: Float[Array, " m"]) -> Any:
         """What is added to the highest derivative of a constraint, given the constraint and its lower derivatives."""
-        polynomial = jnp.ones(1, jnp.result_type(*levels))
+        polynomial = [jnp.ones((), jnp.result_type(*levels))]
         for _ in range(len(levels) // 2):
-            polynomial = jnp.convolve(polynomial, jnp.stack([jnp.ones_like(self.alpha), 2 * self.alpha, self.beta**2]))
+            polynomial = _product(polynomial, [1.0, 2 * self.alpha, self.beta**2])
         if len(levels) % 2:
-            polynomial = jnp.convolve(polynomial, jnp.stack([jnp.ones_like(self.alpha), self.alpha]))
+            polynomial = _product(polynomial, [1.0, self.alpha])
         return sum(c * level for c, level in zip(polynomial[:0:-1], levels, strict=True))
+
+
+def _product(a: list[Any], b: list[Any]) -> list[Any]:
+    """The coefficients of a product of polynomials; `jnp.convolve` is a library call, which no kernel can have in it."""
+    return [sum(a[i] * b[k - i] for i in range(len(a)) if 0 <= k - i < len(b)) for k in range(len(a) + len(b) - 1)]
