@@ -7,8 +7,8 @@ import jax
 from jax.extend.core import ClosedJaxpr, Jaxpr
 
 
-# Numbers computed. Double pendulum, 181: a step of DOP853 takes 1.8 µs with its stages written out, 2.5 in a loop. A reaction
-# network, 2176: 21 and 12, and half the time to compile.
+# Numbers computed. A step of DOP853 with its stages written out and in a loop: chain of 4 links 2.0 and 4.8 µs, of 8 links 4.0
+# and 6.3 µs; of 16 links 8.8 and 8.5 µs, and 12 s to compile in place of 3.
 LARGE = 4000
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Array
 from ..kernels import is_large, scalarise, subroutine
 
 
-# A larger state goes through the stages in a loop, as one with a large field does: seconds in place of a minute to compile.
+# A larger state goes through the stages in a loop, as one with a large field does: compiling takes a quarter of the time.
 UNROLLED = 40
 
 
