@@ -239,6 +239,22 @@ def test_lanes_are_refilled(shared, count):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
 
 
+def test_a_loop_as_long_for_all_lanes_is_shared():
+    def fn(x, y):
+        return jax.lax.while_loop(
+            lambda c: c[0][0] < 9, lambda c: (c[0] + 1 + 0.5 * jnp.sin(c[0]), jnp.cos(c[0]) * c[1]), (y, x)
+        )
+
+    jaxpr = jax.make_jaxpr(fn)(X, np.abs(X))
+    assert main_loop(jaxpr)
+    assert "ctpop" not in written(jaxpr, (True, False))
+    assert "ctpop" in written(jaxpr, (False, True))
+    xs = X * np.arange(1, LANES + 1)[:, None]
+    found = jax.jit(compiled(jaxpr, (True, False)))(xs, np.abs(X))
+    for a, b in zip(found, jax.vmap(fn, (0, None), out_axes=0)(xs, np.abs(X)), strict=True):
+        np.testing.assert_allclose(a, b, **CLOSE)
+
+
 def test_a_loop_that_is_little_of_the_work_is_not_taken_apart():
     assert main_loop(jax.make_jaxpr(flat(elementary))(X)) == ()
     assert main_loop(jax.make_jaxpr(flat(loops))(X)) == ()

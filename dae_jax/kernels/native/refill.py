@@ -15,12 +15,13 @@ from jax.extend.core import ClosedJaxpr
 from ..entries import NotEntryByEntry, objects
 from ..jaxprs import equations, equations_in
 from .control import Control, called_by
+from .dependence import depends_in_loop
 from .frame import Frame
 from .in_memory import SMALL
 from .instructions import Complex, Value
 from .loops import set_apart
 from .memory import Memory, View
-from .operands import of_texts, parts_of, refer, texts
+from .operands import has_lanes, of_texts, parts_of, refer, texts
 from .primitives import CALLS
 
 
@@ -150,6 +151,11 @@ class Refilled:
         p = eqn.params
         count = p["cond_nconsts"] + p["body_nconsts"]
         first, self.avals = values[count:], [v.aval for v in eqn.outvars]
+        own = [
+            list(map(has_lanes, xs)) for xs in (values[: p["cond_nconsts"]], values[p["cond_nconsts"] : count], first)
+        ]
+        if not all(depends_in_loop(p, own)):
+            raise NotEntryByEntry("a loop that is as long for all lanes")
         self.carry = [self._carried(aval) for aval in self.avals]
         new: list[tuple[Any, Any]] = []
         consts = [self._kept(x, new) for x in values[:count]]
