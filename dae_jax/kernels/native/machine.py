@@ -235,6 +235,9 @@ def _compiled(text: str) -> Any:
         module.verify()
     except RuntimeError as error:  # what LLVM would end the process for
         raise NotEntryByEntry(f"LLVM: {error}") from error
-    engine = llvm.create_mcjit_compiler(module, machine)
+    # By way of an object file, so that no more than the code is kept.
+    code = llvm.ObjectFileRef.from_data(machine.emit_object(module))
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
+    engine.add_object_file(code)
     engine.finalize_object()
     return engine
