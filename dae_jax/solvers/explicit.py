@@ -65,23 +65,11 @@ def _slopes_in_a_loop(a: Any, c: Any, field: Any, t0: Any, t1: Any, h: Any, y0: 
 
     def stage(i: Any, fs: Any) -> Any:
         ti = jnp.where(nodes[i] == 1, t1, t0 + nodes[i] * (t1 - t0))
-        return jax.lax.dynamic_update_index_in_dim(fs, field(ti, _ahead(i, y0, rows[i], fs)), i + 1, 0)
+        yi = y0 + sum(rows[i, j] * fs[j] for j in range(stages - 1))
+        return jax.lax.dynamic_update_index_in_dim(fs, field(ti, yi), i + 1, 0)
 
     fs = jnp.zeros((stages, y0.size), y0.dtype).at[0].set(f0)
     return list(jax.lax.fori_loop(0, stages - 1, stage, fs))
-
-
-@jax.custom_jvp
-def _ahead(i: Any, y0: Any, row: Any, fs: Any) -> Any:
-    """y₀ + Σ rowⱼ fⱼ for j ≤ i, one slope after the other: XLA makes vector code of that, and none of the sum at once."""
-    return jax.lax.fori_loop(0, i + 1, lambda j, y: y + row[j] * fs[j], y0)
-
-
-@_ahead.defjvp
-def _(primals: Any, tangents: Any) -> Any:
-    _, _, row, fs = primals
-    _, dy0, drow, dfs = tangents
-    return _ahead(*primals), dy0 + sum(drow[j] * fs[j] + row[j] * dfs[j] for j in range(len(fs)))
 
 
 class Flat:
