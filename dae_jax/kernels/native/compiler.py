@@ -123,9 +123,7 @@ class _Module:
         code, width = self.code, self.code.width
         size, last = Value("%batch", "i64"), Value("%batch.last", "i64")
         code.stack += [
-            f"%dims.at = getelementptr i8, ptr %arg{self.batched.index(True)}.buffer, i64 {machine.DIMENSIONS_OF_BUFFER}",
-            "%dims = load ptr, ptr %dims.at",
-            f"{size.name} = load i64, ptr %dims",
+            *machine.batch_size(f"arg{self.batched.index(True)}"),
             f"{last.name} = sub i64 {size.name}, 1",
         ]
         if path:

@@ -53,7 +53,7 @@ call:
 }}
 """
 _DATA_OF_BUFFER = 24
-DIMENSIONS_OF_BUFFER = 40
+_DIMENSIONS_OF_BUFFER = 40
 
 _lock = threading.Lock()
 _engines: dict[str, Any] = {}
@@ -71,6 +71,15 @@ def buffer(array: str, k: int, name: str) -> list[str]:
         f"%{name}.buffer = load ptr, ptr %{name}.at",
         f"%{name}.data = getelementptr i8, ptr %{name}.buffer, i64 {_DATA_OF_BUFFER}",
         f"%{name} = load ptr, ptr %{name}.data",
+    ]
+
+
+def batch_size(name: str) -> list[str]:
+    """The instructions that find %batch, the first dimension of the buffer that `buffer` found by this name."""
+    return [
+        f"%dims.at = getelementptr i8, ptr %{name}.buffer, i64 {_DIMENSIONS_OF_BUFFER}",
+        "%dims = load ptr, ptr %dims.at",
+        "%batch = load i64, ptr %dims",
     ]
 
 
@@ -109,9 +118,7 @@ def in_threads(body: list[str], batched: int, enough: int) -> list[str]:
         "%taken = getelementptr ptr, ptr %shared, i64 2",
         "store i64 0, ptr %taken",
         *buffer("%args", batched, "arg"),
-        f"%dims.at = getelementptr i8, ptr %arg.buffer, i64 {DIMENSIONS_OF_BUFFER}",
-        "%dims = load ptr, ptr %dims.at",
-        "%batch = load i64, ptr %dims",
+        *batch_size("arg"),
         f"%large = icmp sge i64 %batch, {enough}",
         *_started(max(others, 0)),
         "call ptr @{name}.thread(ptr %shared)",
