@@ -8,6 +8,7 @@ import pytest
 from dae_jax.kernels.entries import NotEntryByEntry
 from dae_jax.kernels.native import compiled, hindrances
 from dae_jax.kernels.native.compiler import written
+from dae_jax.kernels.native.flat import flattened
 from dae_jax.kernels.native.machine import vector_size
 from dae_jax.kernels.native.refill import main_loop
 
@@ -198,7 +199,7 @@ def test_hindrances(fn, name):
 
 def test_too_large():
     def fn(x):
-        for _ in range(600):
+        for _ in range(2000):
             x = jnp.sin(x) + x[::-1]
         return x
 
@@ -231,7 +232,7 @@ def test_lanes_are_refilled(shared, count):
     times = np.linspace(1, 2, 30) if shared else random.uniform(1, 2, (count, 30))
     batched = (True, not shared)
     jaxpr = jax.make_jaxpr(stepping)(X, np.ones(30))
-    assert main_loop(jaxpr)
+    assert main_loop(flattened(jaxpr)) is not None
     assert "ctpop" in written(jaxpr, batched)
     found = jax.jit(compiled(jaxpr, batched))(xs, times)
     expected = jax.jit(jax.vmap(stepping, (0, None if shared else 0)))(xs, times)
@@ -246,7 +247,7 @@ def test_a_loop_as_long_for_all_lanes_is_shared():
         )
 
     jaxpr = jax.make_jaxpr(fn)(X, np.abs(X))
-    assert main_loop(jaxpr)
+    assert main_loop(flattened(jaxpr)) is not None
     assert "ctpop" not in written(jaxpr, (True, False))
     assert "ctpop" in written(jaxpr, (False, True))
     xs = X * np.arange(1, LANES + 1)[:, None]
@@ -256,5 +257,5 @@ def test_a_loop_as_long_for_all_lanes_is_shared():
 
 
 def test_a_loop_that_is_little_of_the_work_is_not_taken_apart():
-    assert main_loop(jax.make_jaxpr(flat(elementary))(X)) == ()
-    assert main_loop(jax.make_jaxpr(flat(loops))(X)) == ()
+    assert main_loop(flattened(jax.make_jaxpr(flat(elementary))(X))) is None
+    assert main_loop(flattened(jax.make_jaxpr(flat(loops))(X))) is None

@@ -128,7 +128,10 @@ def _forward(fn: Callable[..., Any]) -> Callable[..., Any]:
 
 def _fused(fn: Callable[..., Any]) -> Callable[..., Any]:
     def traced(*args: Any) -> Any:
-        jaxpr, out = jax.make_jaxpr(without_checks(fn), return_shape=True)(*args)
+        # A kernel knows of no mesh; JAX would write down for each number that it lies on none.
+        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)), args)
+        with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
+            jaxpr, out = jax.make_jaxpr(without_checks(fn), return_shape=True)(*shapes)
         return jax.tree.unflatten(jax.tree.structure(out), called(jaxpr, jax.tree.leaves(args)))
 
     return traced

@@ -226,8 +226,8 @@ def _merged(eliminated: Array, kept: Array, level: _Level) -> Array:
     alternate = np.arange(size)
     if np.array_equal(level.eliminated, alternate[::2]) and np.array_equal(level.kept, alternate[1::2]):
         # Two halves like the teeth of two combs: no gather.
-        both = lax.pad(eliminated, jnp.zeros((), eliminated.dtype), [(0, size - (2 * len(eliminated) - 1), 1)])
-        return both + lax.pad(kept, jnp.zeros((), kept.dtype), [(1, size - 2 * len(kept), 1)])
+        pairs = jnp.stack([eliminated[: len(kept)], kept], 1).reshape(-1)
+        return jnp.concatenate([pairs, eliminated[len(kept) :]])
     return take(jnp.concatenate([eliminated, kept]), at)
 
 

@@ -251,15 +251,16 @@ def _inverse(a: Inexact[Array, "n n"]) -> tuple[Inexact[Array, "n n"], Float[Arr
         a, order, smallest = carry
         column = lax.dynamic_slice_in_dim(a, j, 1, 1)[:, 0]
         pivot = jnp.argmax(jnp.where(places >= j, _size(column), -1))
-        row_j = lax.dynamic_index_in_dim(a, j, 0, keepdims=False)
-        row_pivot = lax.dynamic_index_in_dim(a, pivot, 0, keepdims=False)
-        value = lax.dynamic_index_in_dim(row_pivot, j, 0, keepdims=False)
-        row = jnp.where(places == j, 1, row_pivot) / value
+        row_j = lax.dynamic_index_in_dim(a, j, 0)
+        row_pivot = lax.dynamic_index_in_dim(a, pivot, 0)
+        value = lax.dynamic_index_in_dim(column, pivot, 0, keepdims=False)
+        row = jnp.where(places == j, 1, row_pivot) * (1 / value)
         at_j, at_pivot = places == j, places == pivot
         column = jnp.where(at_pivot, lax.dynamic_index_in_dim(column, j, 0, keepdims=False), column)
-        cleared = jnp.where(at_pivot[:, None], row_j, a)
-        cleared = jnp.where(at_j, 0, cleared) - column[:, None] * row
-        a = jnp.where(at_j[:, None], row, cleared)
+        # The rows change places, a unit vector takes the column's; what becomes of row j is of no account.
+        a = lax.dynamic_update_slice_in_dim(a, row_j, pivot, 0)
+        a = lax.dynamic_update_slice_in_dim(a, jnp.zeros((n, 1), a.dtype), j, 1)
+        a = lax.dynamic_update_slice_in_dim(a - column[:, None] * row, row, j, 0)
         first, second = order[j], order[pivot]
         order = jnp.where(at_j, second, jnp.where(at_pivot, first, order))
         return a, order, jnp.minimum(smallest, _size(value))

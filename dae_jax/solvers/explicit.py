@@ -59,17 +59,24 @@ def stage_slopes(
 
 
 def _slopes_in_a_loop(a: Any, c: Any, field: Any, t0: Any, t1: Any, h: Any, y0: Any, f0: Any) -> list[Any]:
-    stages = len(a) + 1
-    rows = h * jnp.asarray([[*row, *[0.0] * (stages - len(row))] for row in a], y0.dtype)
-    nodes = jnp.asarray(c, jnp.result_type(t0))
+    # Of each row the coefficients that are not zero, and where they are; rows are filled up with zeros.
+    used = [np.flatnonzero(row) for row in a]
+    longest = max(map(len, used))
+    places = np.array([np.pad(at, (0, longest - len(at))) for at in used])
+    weights = h * jnp.asarray(
+        [np.pad(row[at], (0, longest - len(at))) for row, at in zip(a, used, strict=True)], y0.dtype
+    )
+    nodes, places = jnp.asarray(c, jnp.result_type(t0)), jnp.asarray(places)
 
     def stage(i: Any, fs: Any) -> Any:
         ti = jnp.where(nodes[i] == 1, t1, t0 + nodes[i] * (t1 - t0))
-        yi = y0 + sum(rows[i, j] * fs[j] for j in range(stages - 1))
+        yi = y0
+        for k in range(longest):
+            yi = yi + weights[i, k] * jax.lax.dynamic_index_in_dim(fs, places[i, k], 0, keepdims=False)
         return jax.lax.dynamic_update_index_in_dim(fs, field(ti, yi), i + 1, 0)
 
-    fs = jnp.zeros((stages, y0.size), y0.dtype).at[0].set(f0)
-    return list(jax.lax.fori_loop(0, stages - 1, stage, fs))
+    fs = jnp.zeros((len(a) + 1, y0.size), y0.dtype).at[0].set(f0)
+    return list(jax.lax.fori_loop(0, len(a), stage, fs))
 
 
 class Flat:

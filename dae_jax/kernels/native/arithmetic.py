@@ -1,7 +1,7 @@
 """JAX's elementwise primitives as instructions."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -40,8 +40,10 @@ class Arithmetic(Instructions):
             return getattr(x[0], name)
         if name == "complex":
             return Complex(*x)
+        if name == "pow" and to.kind == "f":  # of a whole number too
+            return self._of_float(name, [x[0], self.convert(x[1], dtype, to)], kind_of(to), params)
         if dtype.kind == "c":
-            return self._complex(name, x, kind_of(_part(dtype)), params)
+            return self.of_complex(name, x, kind_of(_part(dtype)), params)
         kind = kind_of(dtype)
         if name in _COMPARISONS:
             return self.compare(name, dtype, *x)
@@ -204,7 +206,8 @@ class Arithmetic(Instructions):
             return one
         return self.arithmetic("div", dtype, one, out) if exponent < 0 else out
 
-    def _complex(self, name: str, x: list[Any], kind: str, params: Any) -> Any:
+    def of_complex(self, name: str, x: Sequence[Any], kind: str, params: Any = None) -> Any:
+        """Arithmetic on complex numbers whose parts are of a kind."""
         a, b = parts(x[0])
         minus = lambda y: self.op("fneg", kind, y)
         if name in ("neg", "conj"):

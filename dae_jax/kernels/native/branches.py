@@ -5,11 +5,10 @@ from typing import Any
 import numpy as np
 
 from ..entries import is_number
-from .in_memory import SMALL
+from .arrays import SMALL, Buffer, View
 from .instructions import Value
 from .loops import Loops
-from .memory import View
-from .operands import has_lanes, of_texts, parts_of, texts
+from .operands import has_lanes, kinds_of, of_texts, texts
 from .primitives import Primitives
 
 
@@ -30,6 +29,7 @@ class Branches(Loops):
             else:
                 here = code.compare("le" if k == 0 else "ge" if k == last else "eq", dtype, index, dtype.type(k))
             taken.append(code.op("and", "i1", mask, here) if mask is not None and here.lanes else here)
+        kept = hold(operands)
         lines, before = code.lines, code.block
         found, written, starts, ends = [], [], [], []
         for branch, here in zip(branches, taken, strict=True):
@@ -38,7 +38,7 @@ class Branches(Loops):
             code.label(starts[-1])
             code.mask = here if here.lanes else mask
             with code.scope():
-                found.append(self.run(branch, operands))
+                found.append(list(map(code.settled, self.run(branch, operands))))
             written.append(code.lines)
             ends.append(code.block)
         code.lines, code.block, code.mask = lines, before, mask
@@ -59,7 +59,17 @@ class Branches(Loops):
             code.label(after)
             for out in outs:
                 out.join(end, skipped)
+        for buffer in kept:
+            buffer.held = False
         return [out.value() for out in outs]
+
+
+def hold(xs: list[Any]) -> list[Buffer]:
+    """Keeps the memory of arrays; gives what was not kept before."""
+    found = [buffer for x in xs for buffer in getattr(x, "buffers", ()) if not buffer.held]
+    for buffer in found:
+        buffer.held = True
+    return found
 
 
 class Merged:
@@ -68,7 +78,7 @@ class Merged:
     def __init__(self, run: Primitives, aval: Any, values: list[Any], each: bool) -> None:
         self.run, self.aval, self.values = run, aval, values
         self.lanes = each or any(map(has_lanes, values))
-        self.kinds = [] if aval.size > SMALL else parts_of(aval)
+        self.kinds = [] if aval.size > SMALL else kinds_of(aval)
         self.texts = ["zeroinitializer" if self.lanes else "poison"] * len(self.kinds)
         self.view: View | None = None
         if aval.size > SMALL:

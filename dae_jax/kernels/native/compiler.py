@@ -11,10 +11,11 @@ from jax.extend.core import ClosedJaxpr
 from ..entries import NotEntryByEntry
 from ..jaxprs import equations
 from . import machine
+from .arrays import SMALL, Buffer, View, row_major
 from .control import KNOWN, Control
-from .in_memory import LARGE, SMALL
-from .instructions import KINDS, Value, kind_of
-from .memory import Buffer, Memory, View, row_major
+from .flat import flattened
+from .instructions import KINDS, Value, parts_of
+from .memory import Memory
 from .refill import Refilled, main_loop
 
 
@@ -30,10 +31,11 @@ def hindrances(jaxpr: ClosedJaxpr) -> tuple[str, ...]:
     """The names of what keeps a function from being compiled here; empty if nothing does."""
     found, size = [], 0
     for eqn in equations(jaxpr):
-        avals = [v.aval for v in (*eqn.invars, *eqn.outvars)]
-        if eqn.effects or eqn.primitive.name not in KNOWN or not all(map(_has_kind, avals)):
+        ins, outs = ([v.aval for v in vs] for vs in (eqn.invars, eqn.outvars))
+        if eqn.effects or eqn.primitive.name not in KNOWN or not all(map(_has_kind, ins + outs)):
             found.append(eqn.primitive.name)
-        size += sum(a.size if a.size <= LARGE else 1 for a in avals[len(eqn.invars) :])
+        # A loop over an array takes about as many instructions as a few entries do.
+        size += sum(min(a.size, SMALL) for a in outs)
     if size > LIMIT or not machine.available():
         found.append("size")
     return tuple(dict.fromkeys(found))
@@ -50,11 +52,12 @@ def written(jaxpr: ClosedJaxpr, batched: Sequence[bool] = ()) -> str:
     With `batched` inputs the function is that of a batch: these inputs, and all outputs, have a leading axis of any
     length. Raises `NotEntryByEntry` for what cannot be written.
     """
-    path = main_loop(jaxpr) if any(batched) else ()
-    if path:
+    jaxpr = flattened(jaxpr)
+    place = main_loop(jaxpr) if any(batched) else None
+    if place is not None:
         with contextlib.suppress(NotEntryByEntry):
-            return _Module(jaxpr, batched).text(path)
-    return _Module(jaxpr, batched).text(())
+            return _Module(jaxpr, batched).text(place)
+    return _Module(jaxpr, batched).text(None)
 
 
 class _Module:
@@ -63,13 +66,13 @@ class _Module:
         self.code = Memory(machine.vector_size() if any(batched) else 1)
         self.run = Control(self.code, LIMIT)
 
-    def text(self, path: tuple[int, ...]) -> str:
-        """The module's text; `path`: where the main loop is, if lanes shall be refilled."""
+    def text(self, place: int | None) -> str:
+        """The module's text; `place`: where the main loop is, if lanes shall be refilled."""
         code, lanes = self.code, any(self.batched)
         ins, outs = self.jaxpr.jaxpr.invars, self.jaxpr.jaxpr.outvars
         code.block = "start"
         if lanes:
-            self._batch(path)
+            self._batch(place)
         else:
             self._store(self.run.run(self.jaxpr, self._arguments(None)), None, None)
         found = [line for k in range(len(ins)) for line in machine.buffer("%args", k, f"arg{k}")]
@@ -106,7 +109,7 @@ class _Module:
         before, code.mask = code.mask, mask
         for k, (v, x) in enumerate(zip(self.jaxpr.jaxpr.outvars, results, strict=True)):
             to = self._view(f"%result{k}", v.aval, row, writable=True)
-            if isinstance(x, View) and x.size > SMALL:
+            if not isinstance(x, np.ndarray) and x.size > SMALL:
                 code.assign(to, x)
                 continue
             for index in np.ndindex(v.aval.shape):
@@ -114,11 +117,12 @@ class _Module:
         code.mask = before
 
     def _view(self, pointer: str, aval: Any, row: Value | None, writable: bool) -> View:
-        buffer = Buffer(pointer, kind_of(aval.dtype), False, writable)
+        kind, parts = parts_of(aval.dtype)
+        buffer = Buffer(pointer, kind, False, writable, parts)
         place = 0 if row is None else self.code.times(row, aval.size)
-        return View(buffer, np.dtype(aval.dtype), aval.shape, row_major(aval.shape), place)
+        return View(np.dtype(aval.dtype), aval.shape, buffer, row_major(aval.shape), place)
 
-    def _batch(self, path: tuple[int, ...]) -> None:
+    def _batch(self, place: int | None) -> None:
         """All elements that this thread gets: threads take them from a counter, as they get on."""
         code, width = self.code, self.code.width
         size, last = Value("%batch", "i64"), Value("%batch.last", "i64")
@@ -126,8 +130,8 @@ class _Module:
             *machine.batch_size(f"arg{self.batched.index(True)}"),
             f"{last.name} = sub i64 {size.name}, 1",
         ]
-        if path:
-            Refilled(code, self.run, self._arguments, self._store, size, last).write(self.jaxpr, path)
+        if place is not None:
+            Refilled(code, self.run, self._arguments, self._store, size, last).write(self.jaxpr, place)
             return
         # A vector of elements at a time; the lanes that the last one has too many repeat the last element.
         lanes = Value("<" + ", ".join(f"i64 {k}" for k in range(width)) + ">", "i64", True)
@@ -139,9 +143,9 @@ class _Module:
         code.lines.append(f"br i1 {left.name}, label %{more}, label %{done}")
         code.label(more)
         with code.scope():
-            place = code.op("add", "i64", start, lanes)
-            row = code.intrinsic("smin", "i64", place, last)
-            inside = code.op("icmp sle", "i64", place, last, result="i1")
+            element = code.op("add", "i64", start, lanes)
+            row = code.intrinsic("smin", "i64", element, last)
+            inside = code.op("icmp sle", "i64", element, last, result="i1")
             self._store(self.run.run(self.jaxpr, self._arguments(row)), row, inside)
         code.jump("next")
         code.label(done)

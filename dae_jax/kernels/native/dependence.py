@@ -8,8 +8,8 @@ from typing import Any
 
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from .in_memory import SMALL
-from .primitives import CALLS
+from .arrays import SMALL
+from .flat import CALLS
 
 
 _AT_A_PLACE = frozenset({"dynamic_slice", "dynamic_update_slice", "gather", "scatter", "scatter-add", "maybe_set"})

@@ -1,5 +1,6 @@
 """A jaxpr that is being run."""
 
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,10 @@ class Frame:
     def __init__(self, run: Primitives, closed: ClosedJaxpr, args: list[Any]) -> None:
         self.run, self.jaxpr = run, closed.jaxpr
         self.values: dict[Any, Any] = {}
+        self._let_go: dict[Any, None] = {}
         self._last: dict[Any, int] = {}
+        read = [v for eqn in self.jaxpr.eqns for v in eqn.invars] + self.jaxpr.outvars
+        self._uses = Counter(v for v in read if isinstance(v, Var))
         for i, eqn in enumerate(self.jaxpr.eqns):
             self._last.update((v, i) for v in eqn.invars if isinstance(v, Var))
         self._last.update((v, len(self.jaxpr.eqns)) for v in self.jaxpr.outvars if isinstance(v, Var))
@@ -26,6 +30,7 @@ class Frame:
     def _bind(self, variables: Any, values: list[Any], now: int) -> None:
         for v, x in zip(variables, values, strict=True):
             if self._last.get(v, -1) > now:
+                x = self.run.code.settled(x) if self._uses[v] > 1 else x
                 self.values[v] = x
                 refer(x, 1)
 
@@ -35,13 +40,17 @@ class Frame:
     def operands(self, i: int) -> list[Any]:
         """The operands of equation i; those that nothing else needs are let go."""
         found = [self._read(v) for v in self.jaxpr.eqns[i].invars]
-        for v in {v for v in self.jaxpr.eqns[i].invars if isinstance(v, Var) and self._last[v] == i}:
-            refer(self.values.pop(v), -1)
+        for v in dict.fromkeys(v for v in self.jaxpr.eqns[i].invars if isinstance(v, Var) and self._last[v] == i):
+            x = self.values.pop(v)
+            refer(x, -1)
+            self._let_go.update(dict.fromkeys(getattr(x, "buffers", ())))
         return found
 
     def give(self, i: int, values: list[Any]) -> None:
         """The results of equation i."""
         self._bind(self.jaxpr.eqns[i].outvars, values, i)
+        self.run.code.recycle(self._let_go)
+        self._let_go.clear()
 
     def advance(self, start: int, stop: int) -> None:
         """Runs the equations from `start` to `stop`."""

@@ -50,6 +50,12 @@ def kind_of(dtype: Any) -> str:
     return kind
 
 
+def parts_of(dtype: Any) -> tuple[str, int]:
+    """The LLVM type of the parts of a number, and how many it has."""
+    dtype = np.dtype(dtype)
+    return (kind_of(f"float{4 * dtype.itemsize}"), 2) if dtype.kind == "c" else (kind_of(dtype), 1)
+
+
 class Instructions:
     """A function's instructions, written one after another."""
 

@@ -8,11 +8,12 @@ from jax.extend.core import ClosedJaxpr
 
 from ..entries import objects
 from ..jaxprs import equations
+from .arrays import SMALL, View
 from .dependence import depends_in_loop, depends_in_scan
-from .in_memory import LARGE, SMALL
+from .in_memory import LARGE
 from .instructions import Value
-from .memory import Memory, View
-from .operands import has_lanes, of_texts, parts_of, refer, texts
+from .memory import Memory
+from .operands import has_lanes, kinds_of, of_texts, refer, texts
 from .primitives import Primitives
 
 
@@ -89,9 +90,8 @@ class Loops(Primitives):
             at = code.op("sub", "i64", length - 1, i) if p["reverse"] else i
             now = [code.row(x, at) for x in rows]
             out = self.run(inner, [*consts, *carry.values, *(x if x.size > SMALL else code.entries(x) for x in now)])
-            with code.unmasked():
-                for y, value in zip(ys, out[m:], strict=True):
-                    code.assign(code.row(y, at), value)
+            for y, value in zip(ys, out[m:], strict=True):
+                code.assign(code.row(y, at), value, fresh=True)
             phis += carry.turn(out[:m], entered, None)
         for x in (*consts, *xs):
             refer(x, -1)
@@ -128,11 +128,12 @@ class Carry:
             if aval.size > SMALL:
                 x = run.own(x, aval.dtype)
                 refer(x, 1)
+                x.buffer.held = True
                 self.names.append([])
                 self.first.append([])
             else:
                 self.first.append(texts(run.code, aval, run.code.entries(x), each))
-                self.names.append([f"%{run.code.name()}" for _ in parts_of(aval)])
+                self.names.append([f"%{run.code.name()}" for _ in kinds_of(aval)])
                 x = of_texts(self.names[-1], aval, each)
             self.values.append(x)
         for x in self.values:
@@ -156,13 +157,13 @@ class Carry:
                         f"select {code.type('i1', True)} {mask.name}, {code.type(kind, True)} {y}, {code.type(kind, True)} {z}",
                         kind, True,
                     ).name
-                    for y, z, kind in zip(found, names, parts_of(aval), strict=True)
+                    for y, z, kind in zip(found, names, kinds_of(aval), strict=True)
                 ]  # fmt: skip
             following.append(found)
         for aval, names, before, after, each in zip(
             self.avals, self.names, self.first, following, self.lanes, strict=True
         ):
-            kinds = parts_of(aval) if names else []
+            kinds = kinds_of(aval) if names else []
             for name, x, y, kind in zip(names, before, after, kinds, strict=True):
                 vector = code.type(kind, each)
                 phis.append(f"{name} = phi {vector} [ {x}, %{entered} ], [ {y}, %{code.block} ]")
@@ -171,6 +172,7 @@ class Carry:
 
 def set_apart(code: Memory, new: list[Any], carry: list[Any], avals: list[Any]) -> list[Any]:
     """What a turn gives, copied where it lies in a buffer of the loop's that gets something else."""
+    new = list(map(code.settled, new))
     held = {x.buffer for x in carry if isinstance(x, View)}
 
     def overwritten(x: Any, own: Any) -> bool:

@@ -1,68 +1,25 @@
-"""Arrays in memory: strided views of buffers, and loops over them.
+"""Loops over arrays in memory: reading, writing, adding up.
 
-With lanes a buffer holds the numbers of all lanes side by side, entry after entry. A buffer that nothing else refers to
-is updated in place.
+With lanes a buffer holds the numbers of all lanes side by side, entry after entry.
 """
 
 import contextlib
-import dataclasses
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from ..entries import NotEntryByEntry, objects
+from ..entries import is_number, objects
 from .arithmetic import Arithmetic
-from .instructions import BYTES, Complex, Value, kind_of
+from .arrays import SMALL, Buffer, Deferred, View, row_major
+from .instructions import BYTES, Complex, Value, parts, parts_of
 
 
 # Bytes of a buffer that the stack holds; larger ones are taken from the heap, all at once.
 ON_STACK = 1024
-
-
-@dataclasses.dataclass(eq=False)
-class Buffer:
-    """Memory for numbers of one type. `references` counts the variables that hold a view of it."""
-
-    pointer: str
-    kind: str
-    lanes: bool
-    writable: bool = True
-    references: int = 0
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class View:
-    """Entry i is number offset + i·strides of the buffer."""
-
-    buffer: Buffer
-    dtype: np.dtype
-    shape: tuple[int, ...]
-    strides: tuple[int, ...]
-    offset: Any = 0
-
-    @property
-    def size(self) -> int:
-        return math.prod(self.shape)
-
-    @property
-    def ndim(self) -> int:
-        return len(self.shape)
-
-    @property
-    def contiguous(self) -> bool:
-        return self.strides == row_major(self.shape)
-
-    @property
-    def whole(self) -> bool:
-        """Whether the entries are those of the buffer, in order."""
-        return self.contiguous and isinstance(self.offset, int) and self.offset == 0
-
-
-def row_major(shape: Sequence[int]) -> tuple[int, ...]:
-    """The strides of an array whose last index runs fastest."""
-    return tuple(math.prod(shape[i + 1 :]) for i in range(len(shape)))
+# A loop's body has no more entries written out than these.
+WRITTEN_OUT = 4
 
 
 class Memory(Arithmetic):
@@ -71,8 +28,12 @@ class Memory(Arithmetic):
     def __init__(self, width: int = 1) -> None:
         super().__init__(width)
         self.mask: Value | None = None
+        # What is in memory stays there, unless it has fewer entries; with lanes each of them is a vector.
+        self.few = 8 if width == 1 else SMALL
         self.stack: list[str] = []
         self.heap = 0
+        self.free: dict[int, list[str]] = {}
+        self.recycles = True
         self.constants: list[str] = []
 
     # Integers that index
@@ -117,7 +78,17 @@ class Memory(Arithmetic):
         out = self.pure(f"getelementptr {stored}, ptr {buffer.pointer}, {index}", "ptr", each)
         return out.name, each
 
-    def load(self, buffer: Buffer, place: Any) -> Value:
+    def load(self, buffer: Buffer, place: Any) -> Any:
+        """A number."""
+        if buffer.parts == 1:
+            return self._load(buffer, place)
+        return Complex(*(self._load(buffer, self._part(buffer, place, k)) for k in range(2)))
+
+    def _part(self, buffer: Buffer, place: Any, k: int) -> Any:
+        """Where the k-th part of a complex number is."""
+        return self.plus(place, k * buffer.plane) if buffer.plane else self.plus(self.times(place, 2), k)
+
+    def _load(self, buffer: Buffer, place: Any) -> Value:
         stored = self._stored(buffer)
         address, each = self._address(buffer, place)
         lanes = each or buffer.lanes
@@ -137,6 +108,13 @@ class Memory(Arithmetic):
 
     def store(self, buffer: Buffer, place: Any, x: Any) -> None:
         """Stores a number, in the lanes that take part."""
+        if buffer.parts == 1:
+            self._store(buffer, place, x)
+            return
+        for k, part in enumerate(parts(x)):
+            self._store(buffer, self._part(buffer, place, k), part)
+
+    def _store(self, buffer: Buffer, place: Any, x: Any) -> None:
         stored = self._stored(buffer)
         if buffer.kind == "i1":
             x = self.cast("zext", x, "i8") if isinstance(x, Value) else np.int8(x)
@@ -182,48 +160,85 @@ class Memory(Arithmetic):
         self.jump(head)
         self.label(after)
 
-    @contextlib.contextmanager
-    def each(self, shape: Sequence[int]) -> Iterator[list[Any]]:
-        """The indices of an array, one after another."""
+    def for_each(self, shape: Sequence[int], action: Callable[[list[Any]], None], few: int = WRITTEN_OUT) -> None:
+        """Does something with each index, in loops whose body has the last `few` written out."""
+        outer, size = len(shape), 1
+        while outer and size * shape[outer - 1] <= few:
+            outer, size = outer - 1, size * shape[outer - 1]
         with contextlib.ExitStack() as stack:
-            yield [0 if n == 1 else stack.enter_context(self.loop(n)) for n in shape]
+            index = [0 if n == 1 else stack.enter_context(self.loop(n)) for n in shape[:outer]]
+            for inner in np.ndindex(*shape[outer:]):
+                action([*index, *inner])
+
+    def accumulated(
+        self,
+        shape: Sequence[int],
+        first: Sequence[Any],
+        kinds: Sequence[str],
+        step: Callable[[list[Any], list[Any]], Sequence[Any]],
+    ) -> list[Any]:
+        """What `step(found, index)` makes of the first numbers, index after index."""
+        lanes = self.width > 1
+
+        def over(index: list[Any], found: list[Any]) -> list[Any]:
+            if len(index) == len(shape):
+                return list(step(found, index))
+            before, phis = self.block, []
+            carried = [Value(f"%{self.name()}", kind, lanes) for kind in kinds]
+            with self.loop(shape[len(index)], phis) as i:
+                for x, y, z in zip(carried, found, over([*index, i], carried), strict=True):
+                    start, after = (self.text(n, x.kind, lanes) for n in (y, z))
+                    vector = self.type(x.kind, lanes)
+                    phis.append(f"{x.name} = phi {vector} [ {start}, %{before} ], [ {after}, %{self.block} ]")
+            return list(carried)
+
+        found = [self.copy(x, kind) if lanes else x for x, kind in zip(first, kinds, strict=True)]
+        return over([], [self.in_lanes(x) for x in found] if lanes else found)
 
     # Arrays
 
-    def buffer(self, kind: str, size: int) -> Buffer:
-        """New memory."""
-        if kind not in BYTES:
-            raise NotEntryByEntry(kind)
-        size *= BYTES[kind] * self.width
+    def _buffer(self, dtype: np.dtype, size: int) -> Buffer:
+        kind, parts = parts_of(dtype)
+        plane, size = size, size * parts * BYTES[kind] * self.width
+        free = self.free.get(size)
+        if free:
+            return Buffer(free.pop(), kind, self.width > 1, parts=parts, plane=plane, bytes=size)
         pointer = f"%{self.name()}"
         if size <= ON_STACK:
             self.stack.append(f"{pointer} = alloca [{size} x i8], align 64")
         else:
             self.stack.append(f"{pointer} = getelementptr i8, ptr %heap, i64 {self.heap}")
-            self.heap += -(-size // 64) * 64
-        return Buffer(pointer, kind, self.width > 1)
+            self.heap += -(-size // 64) * 64 + 192
+        return Buffer(pointer, kind, self.width > 1, parts=parts, plane=plane, bytes=size)
+
+    def recycle(self, buffers: Iterable[Buffer]) -> None:
+        """Memory that nothing needs any more is used again, while it is in the cache."""
+        for buffer in buffers:
+            if buffer.bytes and not buffer.references and not buffer.held and self.recycles:
+                self.free.setdefault(buffer.bytes, []).append(buffer.pointer)
+                buffer.bytes = 0
 
     def new(self, dtype: Any, shape: Sequence[int]) -> View:
         dtype = np.dtype(dtype)
         shape = tuple(shape)
-        return View(self.buffer(kind_of(dtype), max(math.prod(shape), 1)), dtype, shape, row_major(shape))
+        return View(dtype, shape, self._buffer(dtype, max(math.prod(shape), 1)), row_major(shape))
 
     def constant_view(self, x: np.ndarray) -> View:
         """A known array, as data of the module."""
-        kind = kind_of(x.dtype)
+        kind, parts = parts_of(x.dtype)
         stored = "i8" if kind == "i1" else kind
         name = f"@{{name}}.{self.name()}"
-        numbers = ", ".join(
-            f"{stored} {self.text(y, kind) if kind != 'i1' else int(y)}" for y in np.ascontiguousarray(x).ravel()
-        )
-        self.constants.append(f"{name} = private constant [{x.size} x {stored}] [{numbers}], align 64")
-        return View(Buffer(name, kind, False, writable=False), x.dtype, x.shape, row_major(x.shape))
+        numbers = np.ascontiguousarray(x).ravel()
+        numbers = numbers.view(numbers.real.dtype) if parts == 2 else numbers
+        texts = ", ".join(f"{stored} {self.text(y, kind) if kind != 'i1' else int(y)}" for y in numbers)
+        self.constants.append(f"{name} = private constant [{len(numbers)} x {stored}] [{texts}], align 64")
+        return View(x.dtype, x.shape, Buffer(name, kind, False, writable=False, parts=parts), row_major(x.shape))
 
     def entry(self, x: Any, index: Sequence[Any]) -> Any:
         """One entry of an array."""
         if isinstance(x, View):
             return self.load(x.buffer, self.at(x, index))
-        return x[tuple(index)] if x.ndim else x[()]
+        return x.read(index) if isinstance(x, Deferred) else x[tuple(index)] if x.ndim else x[()]
 
     def entries(self, x: Any) -> np.ndarray:
         """An array as entries."""
@@ -231,20 +246,34 @@ class Memory(Arithmetic):
             return x
         return objects([self.entry(x, i) for i in np.ndindex(x.shape)], x.shape)
 
+    def flat(self, x: Any) -> Callable[[Any], Any] | None:
+        """How an entry is read by its place in row-major order, where that is as simple as by its index."""
+        if isinstance(x, View) and x.contiguous:
+            return lambda place: self.load(x.buffer, self.plus(x.offset, place))
+        if not isinstance(x, np.ndarray) and x.ndim == 1:
+            return lambda place: self.entry(x, [place])
+        return x.flat if isinstance(x, Deferred) else None
+
     def memory(self, x: Any, dtype: Any) -> View:
         """An array in memory."""
         if isinstance(x, View):
             return x
+        if isinstance(x, Deferred):
+            return self.copied(x, x.dtype)
+        numbers = list(x.ravel())
+        if numbers and all(map(is_number, numbers)):
+            return self.constant_view(np.array(numbers, dtype).reshape(x.shape))
         out = self.new(dtype, x.shape)
         with self.unmasked():
-            for k, number in enumerate(x.ravel()):
-                self._real(number)
+            for k, number in enumerate(numbers):
                 self.store(out.buffer, k, number)
         return out
 
-    def _real(self, x: Any) -> None:
-        if isinstance(x, Complex) or np.iscomplexobj(x):
-            raise NotEntryByEntry("large arrays of complex numbers")
+    def settled(self, x: Any) -> Any:
+        """An array whose entries are known from here on."""
+        if not isinstance(x, Deferred):
+            return x
+        return self.memory(x, x.dtype) if x.size > self.few else self.entries(x)
 
     @contextlib.contextmanager
     def unmasked(self) -> Iterator[None]:
@@ -255,32 +284,31 @@ class Memory(Arithmetic):
 
     def made(self, dtype: Any, shape: Sequence[int], entry: Callable[[list[Any]], Any]) -> View:
         """A new array, entry by entry."""
-        out = self.new(dtype, shape)
-        with self.each(shape) as index:
-            x = entry(index)
-            self._real(x)
-            with self.unmasked():
-                self.store(out.buffer, self.at(out, index), x)
-        return out
+        return self.copied(Deferred(np.dtype(dtype), tuple(shape), entry, ()), dtype)
 
     def copied(self, x: Any, dtype: Any) -> View:
         """A new array with the same entries."""
-        if isinstance(x, np.ndarray):
-            return self.memory(x, dtype)
-        return self.made(dtype, x.shape, lambda index: self.entry(x, index))
+        out = self.new(dtype, x.shape)
+        self.assign(out, x, fresh=True)
+        return out
 
     def row(self, x: View, i: Any) -> View:
         """x[i]."""
-        return View(x.buffer, x.dtype, x.shape[1:], x.strides[1:], self.at(x, [i, *[0] * (x.ndim - 1)]))
+        return View(x.dtype, x.shape[1:], x.buffer, x.strides[1:], self.at(x, [i, *[0] * (x.ndim - 1)]))
 
-    def assign(self, to: View, x: View) -> None:
-        """Copies the entries of `x`, in the lanes that take part."""
-        if isinstance(x, np.ndarray):
-            for index in np.ndindex(x.shape):
-                self.store(to.buffer, self.at(to, index), x[index])
-            return
-        with self.each(x.shape) as index:
-            self.store(to.buffer, self.at(to, index), self.entry(x, index))
+    def assign(self, to: View, x: Any, fresh: bool = False) -> None:
+        """Copies the entries of `x`, in the lanes that take part; `fresh`: nothing else sees that memory yet."""
+
+        def put(place: Any, number: Any) -> None:
+            with self.unmasked() if fresh else contextlib.nullcontext():
+                self.store(to.buffer, place, number)
+
+        flat = self.flat(x) if to.contiguous and len(to.shape) > 1 else None
+        if flat:
+            self.for_each([to.size], lambda i: put(self.plus(to.offset, i[0]), flat(i[0])))
+        else:
+            few = x.size if isinstance(x, np.ndarray) else WRITTEN_OUT
+            self.for_each(x.shape, lambda index: put(self.at(to, index), self.entry(x, index)), few)
 
 
 def _suffix(kind: str) -> str:

@@ -5,8 +5,9 @@ from typing import Any
 import numpy as np
 
 from ..entries import NotEntryByEntry, objects
-from .instructions import Complex, Value, kind_of, parts
-from .memory import Memory, View
+from .arrays import View
+from .instructions import Complex, Value, parts, parts_of
+from .memory import Memory
 
 
 def texts(code: Memory, aval: Any, x: np.ndarray, lanes: bool) -> list[str]:
@@ -14,23 +15,21 @@ def texts(code: Memory, aval: Any, x: np.ndarray, lanes: bool) -> list[str]:
     numbers = [y for e in x.ravel() for y in (parts(e) if np.dtype(aval.dtype).kind == "c" else (e,))]
     if not lanes and any(isinstance(y, Value) and y.lanes for y in numbers):
         raise NotEntryByEntry("a number of each lane where one for all is expected")
-    return [code.text(y, kind, lanes) for y, kind in zip(numbers, parts_of(aval), strict=True)]
+    return [code.text(y, kind, lanes) for y, kind in zip(numbers, kinds_of(aval), strict=True)]
 
 
 def of_texts(names: list[str], aval: Any, lanes: bool) -> np.ndarray:
     """Entries from the operands that hold them."""
-    values = [Value(name, kind, lanes) for name, kind in zip(names, parts_of(aval), strict=True)]
+    values = [Value(name, kind, lanes) for name, kind in zip(names, kinds_of(aval), strict=True)]
     if np.dtype(aval.dtype).kind == "c":
         values = [Complex(*pair) for pair in zip(values[::2], values[1::2], strict=True)]
     return objects(values, aval.shape)
 
 
-def parts_of(aval: Any) -> list[str]:
+def kinds_of(aval: Any) -> list[str]:
     """The LLVM types of an array's numbers, two for a complex one."""
-    dtype = np.dtype(aval.dtype)
-    if dtype.kind == "c":
-        return [kind_of(f"float{4 * dtype.itemsize}")] * (2 * aval.size)
-    return [kind_of(dtype)] * aval.size
+    kind, count = parts_of(aval.dtype)
+    return [kind] * (count * aval.size)
 
 
 def has_lanes(x: Any) -> bool:
@@ -44,5 +43,5 @@ def has_lanes(x: Any) -> bool:
 
 def refer(x: Any, by: int) -> None:
     """Counts the variables that hold a view of a buffer."""
-    if isinstance(x, View):
-        x.buffer.references += by
+    for buffer in getattr(x, "buffers", ()):
+        buffer.references += by

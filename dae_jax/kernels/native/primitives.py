@@ -1,19 +1,20 @@
 """Primitives of JAX on arrays of entries; what is large, or at a place found at run time, is in memory."""
 
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import jax
 import numpy as np
+from jax.extend.core import ClosedJaxpr
 
-from ..entries import CALLS as OF_CALLS, ELEMENTWISE, STRUCTURAL, NotEntryByEntry, is_number, objects
-from .in_memory import FOLDS, LARGE, MORE_ELEMENTWISE, SMALL, InMemory, identity
-from .instructions import kind_of
-from .memory import View
+from ..entries import ELEMENTWISE, STRUCTURAL, NotEntryByEntry, is_number, objects
+from .flat import flattened
+from .in_memory import FOLDS, LARGE, MORE_ELEMENTWISE, InMemory, identity, in_pairs
+from .memory import Memory
 
 
-CALLS = {**OF_CALLS, "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "custom_vmap_call": "call"}
+# Larger constants are data of the module; what smaller ones give is worked out here.
+KNOWN = 4096
 _CUMULATIVE = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}
 SIMPLE = (
     (ELEMENTWISE - {"digamma", "erf_inv", "lgamma"})
@@ -27,6 +28,16 @@ SIMPLE = (
 
 class Primitives(InMemory):
     """Runs jaxprs by writing instructions for what is not known."""
+
+    def __init__(self, code: Memory, limit: int) -> None:
+        super().__init__(code, limit)
+        self._flat: dict[int, tuple[ClosedJaxpr, ClosedJaxpr]] = {}
+
+    def flat(self, closed: ClosedJaxpr) -> ClosedJaxpr:
+        """A jaxpr without calls."""
+        if id(closed) not in self._flat:
+            self._flat[id(closed)] = closed, flattened(closed)
+        return self._flat[id(closed)][1]
 
     # Arithmetic of entries
 
@@ -53,15 +64,15 @@ class Primitives(InMemory):
         if isinstance(x, jax.core.Tracer):
             raise NotEntryByEntry("a constant that is traced")
         x = np.asarray(x)
-        return self.code.constant_view(x) if x.size > LARGE else super().constant(x)
+        return self.code.constant_view(x) if x.size > KNOWN else super().constant(x)
 
     # Primitives
 
     def equation(self, eqn: Any, args: list[Any]) -> list[Any]:
         name = eqn.primitive.name
         outs = [v.aval for v in eqn.outvars]
-        large = max((a.size for a in outs), default=0) > LARGE
-        if large or any(isinstance(a, View) and a.size > SMALL for a in args):
+        large = max((a.size for a in outs), default=0) > LARGE and not _known(args)
+        if large or any(not isinstance(a, np.ndarray) and a.size > self.code.few for a in args):
             return self.in_memory(eqn, args)
         args = [self.code.entries(a) for a in args]
         if name == "dynamic_slice" and not all(is_number(a[()]) for a in args[1:]):
@@ -105,13 +116,11 @@ class Primitives(InMemory):
     def _folded(self, eqn: Any, x: np.ndarray) -> np.ndarray:
         axes, dtype = eqn.params["axes"], np.dtype(eqn.outvars[0].aval.dtype)
         x = np.moveaxis(x, axes, range(len(axes))).reshape((-1, *eqn.outvars[0].aval.shape))
-        if dtype.kind == "c":
-            raise NotEntryByEntry("reduction of complex numbers")
         combine = functools.partial(self.combined, FOLDS[eqn.primitive.name])
         columns = [list(x[(slice(None), *i)]) for i in np.ndindex(x.shape[1:])]
         if not x.shape[0]:
             columns = [[identity(FOLDS[eqn.primitive.name], dtype)]] * len(columns)
-        return objects([_in_pairs(combine, column) for column in columns], x.shape[1:])
+        return objects([in_pairs(combine, column) for column in columns], x.shape[1:])
 
     def _accumulated(self, eqn: Any, x: np.ndarray) -> np.ndarray:
         out = np.moveaxis(x.copy(), eqn.params["axis"], 0)
@@ -123,28 +132,15 @@ class Primitives(InMemory):
 
     def _extreme(self, eqn: Any, x: np.ndarray) -> np.ndarray:
         (axis,), to = eqn.params["axes"], np.dtype(eqn.params["index_dtype"])
-        dtype, code = np.dtype(eqn.invars[0].aval.dtype), self.code
-        kind, moved = kind_of(dtype), np.moveaxis(x, axis, 0)
-        first = "gt" if eqn.primitive.name == "argmax" else "lt"
-        found = []
-        for j in np.ndindex(moved.shape[1:]):
-            best, place = moved[(0, *j)], to.type(0)
-            for i in range(1, len(moved)):
-                y = moved[(i, *j)]
-                better = code.compare(first, dtype, y, best)
-                if dtype.kind == "f":  # the first number that is undefined wins
-                    undefined = code.op("fcmp uno", kind, y, y, result="i1")
-                    known = code.op("fcmp ord", kind, best, best, result="i1")
-                    better = code.op("and", "i1", known, code.op("or", "i1", undefined, better))
-                best = code.select(better, y, best, kind)
-                place = code.select(better, to.type(i), place, kind_of(to))
-            found.append(place)
-        return objects(found, moved.shape[1:])
+        moved = np.moveaxis(x, axis, 0)
+        better = functools.partial(self.better, eqn)
+        found = [
+            functools.reduce(better, [(moved[(i, *j)], to.type(i)) for i in range(len(moved))])
+            for j in np.ndindex(moved.shape[1:])
+        ]
+        return objects([place for _, place in found], moved.shape[1:])
 
 
-def _in_pairs(combine: Callable[[Any, Any], Any], terms: list[Any]) -> Any:
-    """All terms combined, two by two: none waits for the sum of all before it, and less is rounded off."""
-    while len(terms) > 1:
-        rest = terms[len(terms) // 2 * 2 :]
-        terms = [combine(a, b) for a, b in zip(terms[::2], terms[1::2], strict=False)] + rest
-    return terms[0]
+def _known(args: list[Any]) -> bool:
+    """Whether all entries are numbers."""
+    return all(isinstance(a, np.ndarray) and all(map(is_number, a.ravel())) for a in args)

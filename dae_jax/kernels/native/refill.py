@@ -14,39 +14,27 @@ from jax.extend.core import ClosedJaxpr
 
 from ..entries import NotEntryByEntry, objects
 from ..jaxprs import equations, equations_in
-from .control import Control, called_by
+from .arrays import SMALL, View
+from .control import Control
 from .dependence import depends_in_loop
 from .frame import Frame
-from .in_memory import SMALL
 from .instructions import Complex, Value
 from .loops import set_apart
-from .memory import Memory, View
-from .operands import has_lanes, of_texts, parts_of, refer, texts
-from .primitives import CALLS
+from .memory import Memory
+from .operands import has_lanes, kinds_of, of_texts, refer, texts
 
 
 # What an exchange costs, in turns of the loop of all lanes.
 PATIENCE = 2
 
 
-def main_loop(jaxpr: ClosedJaxpr) -> tuple[int, ...]:
-    """Where the loop is that does most of the work: the place of its equation, after those of the calls around it.
-
-    Empty where no loop has more than half of the equations.
-    """
-    path: list[int] = []
+def main_loop(jaxpr: ClosedJaxpr) -> int | None:
+    """Where in a jaxpr without calls the loop is that does most of the work; `None` where none does more than half."""
     total = sum(1 for _ in equations(jaxpr))
-    while True:
-        sizes = [sum(1 for _ in equations_in(eqn)) for eqn in jaxpr.jaxpr.eqns]
-        if max(sizes, default=0) <= total / 2:
-            return ()
-        path.append(int(np.argmax(sizes)))
-        eqn = jaxpr.jaxpr.eqns[path[-1]]
-        if eqn.primitive.name == "while":
-            return tuple(path)
-        if eqn.primitive.name not in CALLS:
-            return ()
-        jaxpr = called_by(eqn)
+    sizes = [sum(1 for _ in equations_in(eqn)) for eqn in jaxpr.jaxpr.eqns]
+    place = int(np.argmax([0, *sizes])) - 1
+    is_loop = place >= 0 and jaxpr.jaxpr.eqns[place].primitive.name == "while"
+    return place if is_loop and sizes[place] > total / 2 else None
 
 
 class Refilled:
@@ -69,9 +57,11 @@ class Refilled:
         # (name, LLVM type, operand at the entry, after an exchange, after a turn) of each phi node.
         self.phis: list[list[str]] = []
 
-    def write(self, jaxpr: ClosedJaxpr, path: tuple[int, ...]) -> None:
+    def write(self, jaxpr: ClosedJaxpr, place: int) -> None:
         """Writes the loop."""
         code = self.code
+        # What is written first is run last.
+        code.recycles = False
         head, exchange, onwards, body, done = (code.name() for _ in range(5))
         vector = code.type("i64", True)
         row = Value(self._phi(vector, "splat (i64 -1)"), "i64", True)
@@ -84,7 +74,7 @@ class Refilled:
         before, code.lines = code.lines, []
         code.label(exchange)
         with code.scope():
-            p, consts = self._exchange(jaxpr, path, row)
+            p, consts = self._exchange(jaxpr, place, row)
             self.phis[1][3] = "0"
             exchanged = code.block
             code.jump(head)
@@ -137,17 +127,14 @@ class Refilled:
         self.phis.append([f"%{self.code.name()}", kind, first, "", ""])
         return self.phis[-1][0]
 
-    def _exchange(self, jaxpr: ClosedJaxpr, path: tuple[int, ...], row: Value) -> tuple[Any, list[Any]]:
+    def _exchange(self, jaxpr: ClosedJaxpr, place: int, row: Value) -> tuple[Any, list[Any]]:
         code, free = self.code, self.free
         following = code.select(free, self._next(), row, "i64")
         self.phis[0][3] = following.name
-        frames, values = [], self.arguments(code.intrinsic("smin", "i64", following, self.last))
-        for place in path:
-            frames.append(Frame(self.run, jaxpr, values))
-            frames[-1].advance(0, place)
-            values = frames[-1].operands(place)
-            eqn = frames[-1].jaxpr.eqns[place]
-            jaxpr = called_by(eqn) if eqn.primitive.name in CALLS else jaxpr
+        frame = Frame(self.run, jaxpr, self.arguments(code.intrinsic("smin", "i64", following, self.last)))
+        frame.advance(0, place)
+        values, eqn = frame.operands(place), jaxpr.jaxpr.eqns[place]
+        values = list(map(code.settled, values))
         p = eqn.params
         count = p["cond_nconsts"] + p["body_nconsts"]
         first, self.avals = values[count:], [v.aval for v in eqn.outvars]
@@ -159,18 +146,14 @@ class Refilled:
         self.carry = [self._carried(aval) for aval in self.avals]
         new: list[tuple[Any, Any]] = []
         consts = [self._kept(x, new) for x in values[:count]]
-        for frame in frames:
-            frame.values = {v: self._kept(x, new) for v, x in frame.values.items()}
+        frame.values = {v: self._kept(code.settled(x), new) for v, x in frame.values.items()}
 
         # What comes after the loop, in the lanes that are done with it.
         alive = code.op("icmp ult", "i64", row, self.size, result="i1")
         code.mask = code.op("and", "i1", free, alive)
-        out = self.carry
-        for frame, place in zip(reversed(frames), reversed(path), strict=True):
-            frame.give(place, out)
-            frame.advance(place + 1, len(frame.jaxpr.eqns))
-            out = frame.results()
-        self.put(out, row, code.op("and", "i1", free, alive))
+        frame.give(place, self.carry)
+        frame.advance(place + 1, len(frame.jaxpr.eqns))
+        self.put(frame.results(), row, code.op("and", "i1", free, alive))
 
         code.mask = free
         for phi, x in new:
@@ -200,7 +183,7 @@ class Refilled:
         code = self.code
         if aval.size > SMALL:
             return code.new(aval.dtype, aval.shape)
-        names = [self._phi(code.type(kind, True), "zeroinitializer") for kind in parts_of(aval)]
+        names = [self._phi(code.type(kind, True), "zeroinitializer") for kind in kinds_of(aval)]
         return of_texts(names, aval, True)
 
     def _kept(self, x: Any, new: list[tuple[Any, Any]]) -> Any:
@@ -235,7 +218,7 @@ class Refilled:
                     code.assign(own, x)
                 continue
             names = texts(code, aval, own, True)
-            for name, y, kind in zip(names, texts(code, aval, code.entries(x), True), parts_of(aval), strict=True):
+            for name, y, kind in zip(names, texts(code, aval, code.entries(x), True), kinds_of(aval), strict=True):
                 vector = code.type(kind, True)
                 chosen = f"select {code.type('i1', True)} {mask.name}, {vector} {y}, {vector} {name}"
                 phis[name][edge] = name if y == name else code.pure(chosen, kind, True).name
