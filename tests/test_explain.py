@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 import dae_jax
+from dae_jax.kernels import kernel_call
 from dae_jax.scenes import SCENES, chain
-from tests.methods import METHODS
+from tests.methods import METHODS, Method
 
 
 MECHANISMS = [name for name in SCENES if isinstance(SCENES[name]().system, dae_jax.ConstrainedSystem)]
@@ -32,6 +33,43 @@ def test_every_scene_is_one_kernel(name):
 def test_every_method_is_one_kernel(method):
     found = plan(SCENES["pendulum"](), method.solver, formulation=method.formulation)
     assert found.one_kernel, found.hindrances
+
+
+RESIDUAL_METHODS = [
+    Method("bdf", dae_jax.BDF(), 5, adaptive=True),
+    Method("ggl", dae_jax.RadauIIA5(), 5, formulation=dae_jax.GGL(), adaptive=True),
+]
+
+
+@pytest.mark.parametrize("method", [*METHODS, *RESIDUAL_METHODS], ids=lambda m: m.name)
+def test_every_method_is_compiled_by_our_compiler(method, monkeypatch):
+    """A kernel of which our compiler finds out only while writing it that it cannot is left to XLA without a word."""
+    scene = SCENES["pendulum"]()
+    monkeypatch.setattr(kernel_call, "_by_xla", lambda *_: pytest.fail("left to XLA"))
+    controller = diffrax.PIDController(rtol=1e-6, atol=1e-6) if method.adaptive else diffrax.ConstantStepSize()
+
+    def solve(y):
+        return dae_jax.daesolve(
+            scene.system, method.solver, 0.0, 1.0, None if method.adaptive else 0.1, y, scene.args,
+            formulation=method.formulation, stepsize_controller=controller,
+        ).ys  # fmt: skip
+
+    jax.jit(solve).lower(scene.y0)
+    jax.jit(jax.vmap(solve)).lower(jax.tree.map(lambda x: jnp.stack([x] * 9), scene.y0))
+
+
+def test_a_mesh_does_not_hinder(monkeypatch):
+    """Under a mesh JAX writes down for each number how it is spread out, which is no arithmetic."""
+    system = dae_jax.SemiExplicitDAE(lambda t, x, z, k: -k * x * z, lambda t, x, z, k: z - jnp.ones_like(x))
+    monkeypatch.setattr(kernel_call, "_by_xla", lambda *_: pytest.fail("left to XLA"))
+
+    def end(k):
+        return dae_jax.daesolve(system, dae_jax.RadauIIA5(), 0.0, 1.0, None, (jnp.ones(2), jnp.ones(2)), k).ys[0][-1]
+
+    mesh = jax.sharding.Mesh(np.array(jax.devices()[:1]), ("lanes",))
+    spread = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("lanes"))
+    values = jax.jit(jax.vmap(end))(jax.device_put(jnp.linspace(1.0, 2.0, 6), spread))
+    np.testing.assert_allclose(values[:, 0], np.exp(-np.linspace(1, 2, 6)), rtol=1e-4)
 
 
 def test_names_the_primitive_that_prevents_it():

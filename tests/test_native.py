@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dae_jax.kernels.entries import NotEntryByEntry
-from dae_jax.kernels.native import compiled, hindrances
+from dae_jax.kernels.native import compiled, hindrances, machine
 from dae_jax.kernels.native.compiler import written
 from dae_jax.kernels.native.flat import flattened
 from dae_jax.kernels.native.machine import vector_size
@@ -112,6 +112,63 @@ def buffers(x):
     return [i, a, b, y, c, a[3], start, a[i - 5], jnp.sum(b, 0), b.T[1:, ::3] * 2, swapped, a[::-1][:2]]
 
 
+def pieces(x):
+    """What is updated by a piece of itself, or read after it was."""
+    y = jnp.arange(60.0) * x[0]
+    z = y.reshape(20, 3)
+    return [
+        y.at[1:].set(y[:-1]), y.at[:-1].set(y[1:]), jax.lax.dynamic_update_slice(y, y[::-1], (0,)),
+        z.at[jnp.int32(x[0])].set(z[3]), y.at[jnp.arange(59)].set(y[1:] * x[1]), y.at[jnp.arange(59) + 1].add(y[:-1]),
+    ]  # fmt: skip
+
+
+def joined_loops(x):
+    """What is used once is computed where it is used; what is used more often is there once."""
+    a = jnp.linspace(0, x[0], 90)
+    b = jnp.concatenate([jnp.zeros(1), a[:-1]]) - a
+    c = jnp.stack([b[:45], b[45:]], 1)
+    d = (c.T.reshape(2, 5, 9)[:, ::-1] * x[1] + 1)[:, 1:, None, ::2]
+    e = jnp.sum(jnp.square(c), 1)[:, None] * c
+    f, g = jnp.split(jnp.exp(-a) + b, 2)
+    odd = jnp.pad(f[1::2], (1, 2)) - jnp.pad(g[:8], (3, 0), constant_values=2.0).sum()
+    one = jnp.max(jnp.where(a > x[0] / 2, b, c[3, 1]))
+    table = jnp.take(a, np.array([5, 3, 80, 81, 82, 2] * 5))
+    return [
+        b,
+        c,
+        d,
+        e,
+        f * g - jnp.cumsum(g[:1]),
+        odd,
+        one,
+        jnp.argmin(jnp.square(a - x[1] / 3)),
+        jnp.argmax(jnp.where(a > 1, jnp.nan, a)),
+        table,
+        jnp.argmin(jnp.sin(9 * a).reshape(45, 2), 0),
+        jnp.argmax(jnp.sin(9 * a).reshape(30, 3), 1),
+        a[2:88:3] + table[1:30],
+        jnp.unstack(c, axis=1)[1] * 2,
+        jnp.all(a < 7),
+        jnp.sum(jnp.outer(a, a[:30]) * b[:, None], 0),
+        jnp.outer(a, a) @ b,
+        jnp.power(a, jnp.arange(90) % 4),
+    ]
+
+
+def complex_arrays(x):
+    z = (jnp.linspace(0, 1, 36) + 1j * x[0] * jnp.arange(36.0)).reshape(6, 6)
+    i = jnp.int32(x[1])
+
+    def eliminate(j, z):
+        row = jax.lax.dynamic_index_in_dim(z, (j + i) % 6, 0, keepdims=False)
+        return z.at[j].set(row * (1 / (z[j, j] + 3))) * 0.9
+
+    w = jax.lax.fori_loop(0, 20, eliminate, z)
+    short = jax.lax.dynamic_slice(z[0, :3], (i,), (1,))
+    total = jnp.sum(w * jnp.conj(z)), jnp.sum(w[:2, :2]), jnp.prod(z[:2, 1])
+    return [p(y) for y in (w, w @ z, w[i], short, jnp.where(w.real > 0, w, z), *total) for p in (jnp.real, jnp.imag)]
+
+
 def choices(x):
     k = jnp.int32(x[0] * 2)
     return [
@@ -125,7 +182,10 @@ def choices(x):
     ]
 
 
-FUNCTIONS = [elementary, rounding, integers, complex_numbers, reductions, places, loops, buffers, choices]
+FUNCTIONS = [
+    elementary, rounding, integers, complex_numbers, reductions, places, loops, buffers, pieces, joined_loops,
+    complex_arrays, choices,
+]  # fmt: skip
 # XLA's, the C library's and the C library's vector functions differ in the last places; what is iterated amplifies it.
 CLOSE = {"rtol": 2e-13, "atol": 1e-14}
 
@@ -259,3 +319,38 @@ def test_a_loop_as_long_for_all_lanes_is_shared():
 def test_a_loop_that_is_little_of_the_work_is_not_taken_apart():
     assert main_loop(flattened(jax.make_jaxpr(flat(elementary))(X))) is None
     assert main_loop(flattened(jax.make_jaxpr(flat(loops))(X))) is None
+
+
+def test_equal_equations_are_written_once():
+    def fn(x):
+        call = jax.jit(lambda y: jnp.sin(y) * 2.0)
+        return call(x) + call(x), jnp.sin(x) * -0.0, jnp.sin(x) * 0.0, jnp.cos(x)[:0]
+
+    names = [eqn.primitive.name for eqn in flattened(jax.make_jaxpr(fn)(X)).jaxpr.eqns]
+    assert names.count("sin") == 1
+    assert names.count("mul") == 3
+    assert "jit" not in names
+
+
+def test_what_is_used_once_takes_no_memory():
+    def memory(fn):
+        calls = [line for line in written(jax.make_jaxpr(fn)(X)).splitlines() if "call ptr @malloc" in line]
+        return sum(int(line.rstrip(")").split()[-1]) for line in calls)
+
+    line = lambda x: jnp.linspace(0, 1, 2000) * x[0]
+    assert memory(lambda x: jnp.sum(jnp.exp(line(x)) * 3 + 1)) == 0
+    assert 16_000 < memory(lambda x: jnp.sum(jnp.exp(line(x)) * line(x)[::-1] + 1)) < 17_000
+
+
+def test_machine_code_is_kept_with_jax_s_own(tmp_path, monkeypatch):
+    text = written(jax.make_jaxpr(jnp.sin)(X)).replace("{name}", "kept")
+    before = jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    try:
+        code = machine._object_code(text)
+        monkeypatch.delattr(machine, "host")
+        assert machine._object_code(text) == code
+        with pytest.raises(NameError):
+            machine._object_code(text + "\n")
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)

@@ -13,7 +13,7 @@ CALLS = {**OF_CALLS, "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_j
 # They give their first operand, or what is said here; others of equinox mean something to transformations only.
 _GIVES = {
     **dict.fromkeys(
-        "copy copy_p stop_gradient nonbatchable nontraceable nondifferentiable_backward unvmap_max reshard".split(), 0
+        "copy copy_p stop_gradient nonbatchable nontraceable nondifferentiable_backward unvmap_max".split(), 0
     ),
     "select_if_vmap": 1,
 }

@@ -5,6 +5,7 @@ results' buffers goes in, an error (null: none) comes out. The offsets below are
 have 64 bits.
 """
 
+import contextlib
 import ctypes
 import functools
 import hashlib
@@ -12,6 +13,7 @@ import importlib
 import os
 import platform
 import threading
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -230,6 +232,20 @@ def register(module: str) -> str:
 
 
 def _compiled(text: str) -> Any:
+    llvm = _llvm()
+    # By way of an object file, so that no more than the code is kept.
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), host())
+    engine.add_object_file(llvm.ObjectFileRef.from_data(_object_code(text)))
+    engine.finalize_object()
+    return engine
+
+
+def _object_code(text: str) -> bytes:
+    """Machine code, from JAX's compilation cache where that has it."""
+    kept = _cached(text)
+    if kept is not None:
+        with contextlib.suppress(OSError):
+            return kept.read_bytes()
     machine, llvm = host(), _llvm()
     # Without the vectorisation of straight-line code: it gains nothing here, and LLVM 22.1 breaks some functions by it.
     tuning = llvm.create_pipeline_tuning_options(speed_level=2)
@@ -242,9 +258,21 @@ def _compiled(text: str) -> Any:
         module.verify()
     except RuntimeError as error:  # what LLVM would end the process for
         raise NotEntryByEntry(f"LLVM: {error}") from error
-    # By way of an object file, so that no more than the code is kept.
-    code = llvm.ObjectFileRef.from_data(machine.emit_object(module))
-    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
-    engine.add_object_file(code)
-    engine.finalize_object()
-    return engine
+    code = machine.emit_object(module)
+    if kept is not None:
+        with contextlib.suppress(OSError):
+            unfinished = kept.with_suffix(f".{os.getpid()}")
+            unfinished.write_bytes(code)
+            unfinished.replace(kept)
+    return code
+
+
+def _cached(text: str) -> Path | None:
+    """Where JAX's compilation cache keeps the machine code of a module, if there is such a cache."""
+    folder = jax.config.values["jax_compilation_cache_dir"]
+    if not folder or "://" in folder or not jax.config.values["jax_enable_compilation_cache"]:
+        return None
+    llvm = _llvm()
+    features = llvm.get_host_cpu_features().flatten()
+    made_for = f"{llvm.llvm_version_info} {llvm.get_host_cpu_name()} {features} {text}"
+    return Path(folder) / f"dae_jax-{hashlib.sha256(made_for.encode()).hexdigest()}.o"

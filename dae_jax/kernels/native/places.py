@@ -127,12 +127,12 @@ class Places(EntryByEntry):
         if eqn.primitive.name == "dynamic_update_slice":
             update, of = args[1], eqn.invars[2:]
             first = self._starts(args[2:], of, out.shape, update.shape)
-            place = lambda index: (code.at(out, list(map(code.plus, first, index))), None)
-        else:
-            update, p = args[2], eqn.params
-            numbers, sizes = windows(out.shape, update.shape, p["dimension_numbers"])
-            indices = self._indices(eqn, args[1], not isinstance(update, np.ndarray) and update.size > code.few)
-            place = self._places(out, indices, numbers, sizes, p["mode"])
+            code.assign(View(out.dtype, update.shape, out.buffer, out.strides, code.at(out, first)), update)
+            return out
+        update, p = args[2], eqn.params
+        numbers, sizes = windows(out.shape, update.shape, p["dimension_numbers"])
+        indices = self._indices(eqn, args[1], not isinstance(update, np.ndarray) and update.size > code.few)
+        place = self._places(out, indices, numbers, sizes, p["mode"])
 
         def put(index: list[Any], x: Any) -> None:
             at, inside = place(index)
