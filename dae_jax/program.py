@@ -22,10 +22,12 @@ from .solution import RESULTS, DAESolution, Interpolation, all_finite
 from .solvers import (
     DOP853,
     AbstractManifoldSolver,
+    AbstractResidualSolver,
     OrthogonalProjection,
     SelectedResiduals,
     SelectedStates,
     TangentSpace,
+    WithoutFailedSteps,
     first_step,
     unrolled,
 )
@@ -205,6 +207,15 @@ class Solve(eqx.Module):
             return "forward"
         return "reverse" if isinstance(self.adjoint, diffrax.RecursiveCheckpointAdjoint) else "any"
 
+    def _for_derivative(self, solver: Any, y: Any) -> Any:
+        """The solver as diffrax's reverse derivative needs it; the tape knows accepted steps only."""
+        size = sum(leaf.size for leaf in jax.tree.leaves(y))
+        ours = isinstance(solver, AbstractManifoldSolver | AbstractResidualSolver) and not hasattr(
+            solver, "root_finder"
+        )
+        by_diffrax = self.derivative() == "reverse" and not can_be_taped(self, size)
+        return WithoutFailedSteps(solver) if ours and by_diffrax else solver
+
     def between(self) -> bool:
         """Whether points between steps are asked for."""
         return (
@@ -236,7 +247,7 @@ class Solve(eqx.Module):
         saveat = dataclasses.replace(saveat, solver_state=True) if selects else saveat
         sol = diffrax.diffeqsolve(
             self.formulation.term(),
-            solver,
+            self._for_derivative(solver, y),
             t0, t1, dt0, y,
             args=ode, saveat=saveat, stepsize_controller=controller, adjoint=self.adjoint, event=event,
             max_steps=self.max_steps, throw=False, progress_meter=self.progress_meter,

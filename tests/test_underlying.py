@@ -239,23 +239,26 @@ def test_dummy_derivatives_for_a_hundred_seconds(name):
     assert scene.error(times[early], jax.tree.map(lambda y: y[early], sol.ys)) < 2e-6
 
 
-def test_derivatives_through_a_switch():
-    def end(angle, adjoint):
+@pytest.mark.parametrize("tolerance", [1e-6, 1e-9])
+def test_derivatives_through_a_switch(tolerance):
+    """At 1e-6 a step is rejected because a stage is not found on the manifold, which makes a NaN on the way."""
+
+    def end(angle, adjoint, tolerance=tolerance):
         y0 = (jnp.stack([jnp.sin(angle), jnp.cos(angle)]), jnp.zeros(2))
         sol = dae_jax.daesolve(
             PENDULUM.system, dae_jax.DOP853(), 0.0, 1.0, None, y0, formulation=dae_jax.DummyDerivatives(), adjoint=adjoint,
-            stepsize_controller=diffrax.PIDController(rtol=1e-11, atol=1e-11), max_steps=200,
+            stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance), max_steps=100,
         )  # fmt: skip
         return sol.ys[0][-1, 0], sol.stats["switches"]
 
+    forward = jax.jacfwd(lambda a: end(a, diffrax.ForwardMode())[0])(1.2)
     _, switches = end(1.2, diffrax.ForwardMode())
     assert int(switches) >= 1
-    forward = jax.jacfwd(lambda a: end(a, diffrax.ForwardMode())[0])(1.2)
     reverse = jax.grad(lambda a: end(a, diffrax.RecursiveCheckpointAdjoint())[0])(1.2)
-    h = 1e-4
-    central = (end(1.2 + h, diffrax.ForwardMode())[0] - end(1.2 - h, diffrax.ForwardMode())[0]) / (2 * h)
-    np.testing.assert_allclose(forward, central, rtol=1e-6)
-    np.testing.assert_allclose(reverse, forward, rtol=1e-8)
+    # The steps that the reverse derivative repeats have the sizes they had up to round-off.
+    np.testing.assert_allclose(reverse, forward, rtol=1e-11)
+    h, tight = 1e-4, jax.jit(lambda a: end(a, diffrax.ForwardMode(), 1e-11)[0])
+    np.testing.assert_allclose(forward, (tight(1.2 + h) - tight(1.2 - h)) / (2 * h), rtol=max(1e-6, 100 * tolerance))
 
 
 def test_dummy_derivatives_take_no_implicit_solver_of_odes():

@@ -3,6 +3,7 @@
 from .bdf import BDF as BDF
 from .dop853 import DOP853 as DOP853
 from .explicit import unrolled as unrolled
+from .failed_steps import WithoutFailedSteps as WithoutFailedSteps
 from .gauss import Gauss4 as Gauss4
 from .implicit import AbstractImplicitSolver as AbstractImplicitSolver
 from .manifold import AbstractManifoldSolver as AbstractManifoldSolver
