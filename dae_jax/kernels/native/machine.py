@@ -85,9 +85,10 @@ def batch_size(name: str) -> list[str]:
     ]
 
 
-def alone(body: list[str]) -> list[str]:
-    """The kernel that does what `body` says of the buffers %args and %results."""
-    return ["define void @{name}.kernel(ptr %args, ptr %results) {", "entry:", *body, "ret void", "}"]
+def alone(body: list[str], longest: bool) -> list[str]:
+    """The kernel that does what `body` says of the buffers %args and %results; `longest`: by the longest vectors."""
+    width = '"prefer-vector-width"="512" ' if longest else ""
+    return [f"define void @{{name}}.kernel(ptr %args, ptr %results) {width}{{", "entry:", *body, "ret void", "}"]
 
 
 def in_threads(body: list[str], batched: int, enough: int) -> list[str]:

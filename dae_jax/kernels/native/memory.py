@@ -4,6 +4,7 @@ With lanes a buffer holds the numbers of all lanes side by side, entry after ent
 """
 
 import contextlib
+import dataclasses
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
@@ -34,6 +35,7 @@ class Memory(Arithmetic):
         self.heap = 0
         self.free: dict[int, list[str]] = {}
         self.recycles = True
+        self.longest = 0
         self.constants: list[str] = []
 
     # Integers that index
@@ -145,6 +147,7 @@ class Memory(Arithmetic):
         """Runs what is written inside for an index from 0 to `count`; `phis` are other variables of the loop."""
         head, body, after, index, following = (self.name() for _ in range(5))
         before = self.block
+        self.longest = max(self.longest, count if isinstance(count, int) else 0)
         self.jump(head)
         self.label(head)
         here = len(self.lines)
@@ -262,7 +265,10 @@ class Memory(Arithmetic):
             return self.copied(x, x.dtype)
         numbers = list(x.ravel())
         if numbers and all(map(is_number, numbers)):
-            return self.constant_view(np.array(numbers, dtype).reshape(x.shape))
+            known = np.array(numbers, dtype).reshape(x.shape)
+            if known.tobytes() != known.size * known.ravel()[:1].tobytes():
+                return self.constant_view(known)
+            return dataclasses.replace(self.constant_view(known.ravel()[:1]), shape=x.shape, strides=(0,) * x.ndim)
         out = self.new(dtype, x.shape)
         with self.unmasked():
             for k, number in enumerate(numbers):
@@ -303,6 +309,8 @@ class Memory(Arithmetic):
             with self.unmasked() if fresh else contextlib.nullcontext():
                 self.store(to.buffer, place, number)
 
+        if isinstance(x, np.ndarray) and x.size > SMALL and all(map(is_number, x.ravel())):
+            x = self.memory(x, to.dtype)
         flat = self.flat(x) if to.contiguous and len(to.shape) > 1 else None
         if flat:
             self.for_each([to.size], lambda i: put(self.plus(to.offset, i[0]), flat(i[0])))

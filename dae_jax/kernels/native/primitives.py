@@ -71,7 +71,8 @@ class Primitives(InMemory):
     def equation(self, eqn: Any, args: list[Any]) -> list[Any]:
         name = eqn.primitive.name
         outs = [v.aval for v in eqn.outvars]
-        large = max((a.size for a in outs), default=0) > LARGE and not _known(args)
+        largest = max((a.size for a in outs), default=0)
+        large = largest > KNOWN or (largest > LARGE and not _known(args))
         if large or any(not isinstance(a, np.ndarray) and a.size > self.code.few for a in args):
             return self.in_memory(eqn, args)
         args = [self.code.entries(a) for a in args]
