@@ -342,6 +342,16 @@ def test_what_is_used_once_takes_no_memory():
     assert 16_000 < memory(lambda x: jnp.sum(jnp.exp(line(x)) * line(x)[::-1] + 1)) < 17_000
 
 
+def test_long_chains_of_operations_are_cut():
+    def fn(x):
+        y = jnp.linspace(0, 1, 600) * x[0]
+        for k in range(200):
+            y = jnp.sin(y)[::-1] + k * 1e-3 if k % 3 else (y * 1.01).reshape(4, 150)[:, ::-1].reshape(-1)
+        return y
+
+    np.testing.assert_allclose(compiled(jax.make_jaxpr(fn)(X))(X)[0], fn(X), rtol=1e-12)
+
+
 def test_machine_code_is_kept_with_jax_s_own(tmp_path, monkeypatch):
     text = written(jax.make_jaxpr(jnp.sin)(X)).replace("{name}", "kept")
     before = jax.config.values["jax_compilation_cache_dir"]

@@ -74,12 +74,19 @@ class View(_Array):
 class Deferred(_Array):
     """Entry i is what `read` writes the instructions for; `flat` those for an entry by its place in row-major order.
 
-    `buffers`: what is read.
+    `buffers`: what is read; `depth`: how many operations one reading goes through.
     """
 
     read: Callable[[Sequence[Any]], Any]
     buffers: tuple[Buffer, ...]
     flat: Callable[[Any], Any] | None = None
+    depth: int = 0
+
+    def moved(
+        self, shape: Sequence[int], read: Callable[[Sequence[Any]], Any], flat: Callable[[Any], Any] | None = None
+    ) -> "Deferred":
+        """The same entries at other indices."""
+        return dataclasses.replace(self, shape=tuple(shape), read=read, flat=flat, depth=self.depth + 1)
 
 
 def row_major(shape: Sequence[int]) -> tuple[int, ...]:

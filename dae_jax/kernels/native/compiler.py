@@ -13,6 +13,7 @@ from ..jaxprs import equations
 from . import machine
 from .arrays import SMALL, Buffer, View, row_major
 from .control import KNOWN, Control
+from .extent import extent
 from .flat import flattened
 from .instructions import KINDS, Value, parts_of
 from .memory import Memory
@@ -31,14 +32,13 @@ VECTORS = 4
 
 def hindrances(jaxpr: ClosedJaxpr) -> tuple[str, ...]:
     """The names of what keeps a function from being compiled here; empty if nothing does."""
-    found, size = [], 0
+    found = []
     for eqn in equations(jaxpr):
-        ins, outs = ([v.aval for v in vs] for vs in (eqn.invars, eqn.outvars))
-        if eqn.effects or eqn.primitive.name not in KNOWN or not all(map(_has_kind, ins + outs)):
+        avals = [v.aval for v in (*eqn.invars, *eqn.outvars)]
+        if eqn.effects or eqn.primitive.name not in KNOWN or not all(map(_has_kind, avals)):
             found.append(eqn.primitive.name)
-        # A loop over an array takes about as many instructions as a few entries do.
-        size += sum(min(a.size, SMALL) for a in outs)
-    if size > LIMIT or not machine.available():
+    arguments = [v.aval.size > SMALL for v in jaxpr.jaxpr.invars]
+    if not found and (not machine.available() or extent(jaxpr, arguments)[0] > LIMIT):
         found.append("size")
     return tuple(dict.fromkeys(found))
 

@@ -11,6 +11,10 @@ from .operands import refer
 from .primitives import Primitives
 
 
+# More operations than these in one loop would nest our own calls too deep.
+DEEP = 40
+
+
 class Frame:
     """How far it has been run, and the values that are still needed."""
 
@@ -30,7 +34,7 @@ class Frame:
     def _bind(self, variables: Any, values: list[Any], now: int) -> None:
         for v, x in zip(variables, values, strict=True):
             if self._last.get(v, -1) > now:
-                x = self.run.code.settled(x) if self._uses[v] > 1 else x
+                x = self.run.code.settled(x) if self._uses[v] > 1 or getattr(x, "depth", 0) > DEEP else x
                 self.values[v] = x
                 refer(x, 1)
 

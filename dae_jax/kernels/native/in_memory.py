@@ -87,6 +87,7 @@ class InMemory(Places):
             lambda index: one([self.code.entry(a, index if a.ndim else []) for a in args]),
             tuple(b for a in args if not isinstance(a, np.ndarray) for b in a.buffers),
             (lambda place: one([read(place) for read in flat])) if len(flat) == len(args) else None,
+            1 + max((getattr(a, "depth", 0) for a in args), default=0),
         )
 
     def _fold_in_memory(self, eqn: Any, x: View | Deferred) -> Any:
@@ -105,7 +106,7 @@ class InMemory(Places):
         if math.prod(extents) <= SMALL:
             combine = functools.partial(self.combined, name)
             read = lambda at: in_pairs(combine, [entry(at, of) for of in np.ndindex(*extents)] or [first])
-            return Deferred(dtype, tuple(out.shape), read, x.buffers)
+            return Deferred(dtype, tuple(out.shape), read, x.buffers, depth=getattr(x, "depth", 0) + 1)
         if not kept and flat:
             return objects([self._total(name, dtype, [x.size], first, lambda i: flat(i[0]))], ())
         if not kept or max(kept) < max(axes):

@@ -67,10 +67,10 @@ class Places(EntryByEntry):
             read = lambda index: x.read(
                 [code.plus(s, code.times(i, k)) for s, i, k in zip(starts, index, steps, strict=True)]
             )
-            return Deferred(x.dtype, shape, read, x.buffers)
+            return x.moved(shape, read)
         if name == "transpose":
             order = np.argsort(p["permutation"])
-            return Deferred(x.dtype, shape, lambda index: x.read([index[d] for d in order]), x.buffers)
+            return x.moved(shape, lambda index: x.read([index[d] for d in order]))
         flat = code.flat(x)
         if (
             name in ("reshape", "squeeze", "expand_dims", "broadcast_in_dim")
@@ -79,7 +79,7 @@ class Places(EntryByEntry):
             and _in_order(p, x, shape)
         ):
             place = lambda index: functools.reduce(code.plus, map(code.times, index, row_major(shape)))
-            return Deferred(x.dtype, shape, lambda index: flat(place(index)), x.buffers, flat)
+            return x.moved(shape, lambda index: flat(place(index)), flat)
         return x if name in ("copy", "copy_p", "stop_gradient") else None
 
     def pieces(self, eqn: Any, x: View | Deferred) -> list[View | Deferred]:
@@ -94,7 +94,7 @@ class Places(EntryByEntry):
             else:
                 whole = (lambda index: [*index[:axis], 0, *index[axis:]]) if entries else list
                 read = lambda index, after=after, whole=whole: x.read(list(map(self.code.plus, whole(index), after)))
-                out.append(Deferred(x.dtype, shape, read, x.buffers))
+                out.append(x.moved(shape, read))
             start += 1 if entries else shape[axis]
         return out
 
