@@ -2,16 +2,19 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from .progress import Progress
+
+
+if TYPE_CHECKING:  # half of the time that importing the library takes beyond diffrax
+    import optax
 
 
 # Up to this many parameters the derivative is taken in forward mode first: one tangent for each.
@@ -60,7 +63,7 @@ class _Point(NamedTuple):
 def tune(
     loss: Callable[[Any], Any],
     params: PyTree,
-    optimiser: optax.GradientTransformation | None = None,
+    optimiser: "optax.GradientTransformation | None" = None,
     *,
     steps: int,
     starts: int = 1,
@@ -100,6 +103,8 @@ def tune(
     if steps < 1 or starts < 1:
         raise ValueError(f"`steps` and `starts` must be at least 1, but are {steps} and {starts}.")
     if optimiser is None:
+        import optax
+
         rate = optax.cosine_decay_schedule(0.3, steps, 0.01 / 0.3)
         optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.nadam(rate, b2=0.95))
     key = jax.random.key(0) if key is None else key
