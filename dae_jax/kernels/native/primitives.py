@@ -8,6 +8,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 
 from ..entries import ELEMENTWISE, STRUCTURAL, NotEntryByEntry, is_number, objects
+from ..numbers import on_numbers
 from .flat import flattened
 from .in_memory import FOLDS, LARGE, MORE_ELEMENTWISE, InMemory, identity, in_pairs
 from .memory import Memory
@@ -15,6 +16,9 @@ from .memory import Memory
 
 # Larger constants are data of the module; what smaller ones give is worked out here.
 KNOWN = 4096
+_MOVES = frozenset(
+    "broadcast_in_dim concatenate expand_dims iota pad reshape rev slice split squeeze stack transpose unstack".split()
+)
 _CUMULATIVE = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}
 SIMPLE = (
     (ELEMENTWISE - {"digamma", "erf_inv", "lgamma"})
@@ -72,7 +76,7 @@ class Primitives(InMemory):
         name = eqn.primitive.name
         outs = [v.aval for v in eqn.outvars]
         largest = max((a.size for a in outs), default=0)
-        large = largest > KNOWN or (largest > LARGE and not _known(args))
+        large = largest > KNOWN or (largest > LARGE and not _stays_known(eqn, args))
         if large or any(not isinstance(a, np.ndarray) and a.size > self.code.few for a in args):
             return self.in_memory(eqn, args)
         args = [self.code.entries(a) for a in args]
@@ -142,6 +146,11 @@ class Primitives(InMemory):
         return objects([place for _, place in found], moved.shape[1:])
 
 
-def _known(args: list[Any]) -> bool:
-    """Whether all entries are numbers."""
-    return all(isinstance(a, np.ndarray) and all(map(is_number, a.ravel())) for a in args)
+def _stays_known(eqn: Any, args: list[Any]) -> bool:
+    """Whether all operands are numbers, and the results are then too, without an instruction."""
+    if not all(isinstance(a, np.ndarray) and all(map(is_number, a.ravel())) for a in args):
+        return False
+    if eqn.primitive.name not in ELEMENTWISE:
+        return eqn.primitive.name in _MOVES
+    values = [np.array(list(a.ravel()), v.aval.dtype) for a, v in zip(args, eqn.invars, strict=True)]
+    return eqn.primitive.name in ("select_n", "convert_element_type") or on_numbers(eqn, values) is not None
