@@ -191,6 +191,7 @@ class Places(EntryByEntry):
         return place
 
     def taken(self, eqn: Any, args: list[Any]) -> Any:
+        """`gather`."""
         code, p, out = self.code, eqn.params, eqn.outvars[0].aval
         x = code.memory(args[0], eqn.invars[0].aval.dtype)
         dtype = np.dtype(out.dtype)
