@@ -4,7 +4,7 @@ What the kernel is made with is decided when the program that calls it is compil
 our own compiler where it can, else XLA's single kernels, else XLA as it is. A batch becomes lanes of vectors.
 """
 
-import contextlib
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -61,8 +61,12 @@ def _(*args: Any, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> Any:
 
 def _lower(*args: Any, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> list[Any]:
     if not native.hindrances(jaxpr):
-        with contextlib.suppress(NotEntryByEntry):
+        try:
             return native.compiled(jaxpr, lanes)(*args)
+        except NotEntryByEntry:
+            pass
+        except Exception as error:  # XLA can still do it
+            warnings.warn(f"A kernel is left to XLA, please report it: {error!r}", RuntimeWarning, stacklevel=2)
     return _by_xla(jaxpr, lanes, args)
 
 

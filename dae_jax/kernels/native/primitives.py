@@ -152,5 +152,5 @@ def _stays_known(eqn: Any, args: list[Any]) -> bool:
         return False
     if eqn.primitive.name not in ELEMENTWISE:
         return eqn.primitive.name in _MOVES
-    values = [np.array(list(a.ravel()), v.aval.dtype) for a, v in zip(args, eqn.invars, strict=True)]
+    values = [np.array(list(a.ravel()), v.aval.dtype).reshape(a.shape) for a, v in zip(args, eqn.invars, strict=True)]
     return eqn.primitive.name in ("select_n", "convert_element_type") or on_numbers(eqn, values) is not None
