@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from dae_jax.kernels import kernel_call, one_kernel
 from dae_jax.kernels.entries import NotEntryByEntry
 from dae_jax.kernels.native import compiled, hindrances, machine
 from dae_jax.kernels.native.compiler import written
@@ -150,6 +151,8 @@ def joined_loops(x):
         jnp.unstack(c, axis=1)[1] * 2,
         jnp.all(a < 7),
         jnp.take(a, 5),
+        x[0] * jnp.where(jnp.arange(120)[:, None] > jnp.arange(7), 1.0, 2.0)[3],
+        x[0] * (jnp.linspace(0, 1, 840).reshape(120, 7) * jnp.arange(120.0)[:, None])[3],
         jnp.take(a, np.zeros(0, int)),
         x[0] * jnp.sin(jnp.linspace(0, 1, 3000))[7::40],
         jnp.sum(jnp.outer(a, a[:30]) * b[:, None], 0),
@@ -353,6 +356,15 @@ def test_long_chains_of_operations_are_cut():
         return y
 
     np.testing.assert_allclose(compiled(jax.make_jaxpr(fn)(X))(X)[0], fn(X), rtol=1e-12)
+
+
+def test_what_our_compiler_stumbles_over_is_done_by_xla(monkeypatch):
+    def fails(*_):
+        raise ValueError("unforeseen")
+
+    monkeypatch.setattr(kernel_call.native, "compiled", fails)
+    with pytest.warns(RuntimeWarning, match="unforeseen"):
+        np.testing.assert_allclose(jax.jit(one_kernel(lambda x: x * 2, "forward"))(X), 2 * X)
 
 
 def test_machine_code_is_kept_with_jax_s_own(tmp_path, monkeypatch):
