@@ -6,7 +6,7 @@ from typing import Any
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from .arrays import SMALL
-from .flat import CALLS
+from .flat import CALLS, of_solve
 from .in_memory import LARGE
 
 
@@ -34,9 +34,7 @@ def _of_equation(eqn: Any, args: list[bool]) -> tuple[int, list[bool]]:
     if name in CALLS:
         return extent(p[CALLS[name]], args)
     if name == "custom_linear_solve":
-        start = sum(p["const_lengths"][:2])
-        solve = args[start : start + p["const_lengths"].solve] + args[sum(p["const_lengths"]) :]
-        return extent(p["jaxprs"].solve, solve)
+        return extent(p["jaxprs"].solve, of_solve(p, args))
     if name == "while":
         c, b = p["cond_nconsts"], p["body_nconsts"]
         return extent(p["cond_jaxpr"], args[:c] + kept)[0] + extent(p["body_jaxpr"], args[c : c + b] + kept)[0], kept

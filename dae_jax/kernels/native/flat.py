@@ -62,11 +62,7 @@ class _Flat:
         if name in _GIVES:
             return [args[_GIVES[name]]]
         if name == "custom_linear_solve":
-            of_matvec, of_vecmat, of_solve, of_transposed = p["const_lengths"]
-            start = of_matvec + of_vecmat
-            return self.run(
-                p["jaxprs"].solve, args[start : start + of_solve] + args[start + of_solve + of_transposed :]
-            )
+            return self.run(p["jaxprs"].solve, of_solve(p, args))
         if name in _BY_OTHERS:
             scalar = name != "maybe_set" and not args[0].aval.ndim
             return args[:1] if scalar else self.run(_meaning(eqn), args)
@@ -79,6 +75,12 @@ class _Flat:
             found = self._known[key] = [Var(v.aval) for v in eqn.outvars]
             self.eqns.append(eqn.replace(invars=args, outvars=found))
         return found
+
+
+def of_solve(p: Any, args: list[Any]) -> list[Any]:
+    """The operands of a `custom_linear_solve` that the function which finds the solution takes."""
+    start, count = sum(p["const_lengths"][:2]), p["const_lengths"].solve
+    return args[start : start + count] + args[sum(p["const_lengths"]) :]
 
 
 def _like(a: Any, b: Any) -> bool:

@@ -14,9 +14,7 @@ from .instructions import Value
 from .memory import Memory
 
 
-MOVED = frozenset(
-    "broadcast_in_dim copy copy_p dynamic_slice expand_dims reshape rev slice squeeze stop_gradient transpose".split()
-)
+MOVED = frozenset("broadcast_in_dim dynamic_slice expand_dims reshape rev slice squeeze transpose".split())
 
 
 class Places(EntryByEntry):
@@ -80,7 +78,7 @@ class Places(EntryByEntry):
         ):
             place = lambda index: functools.reduce(code.plus, map(code.times, index, row_major(shape)))
             return x.moved(shape, lambda index: flat(place(index)), flat)
-        return x if name in ("copy", "copy_p", "stop_gradient") else None
+        return None
 
     def pieces(self, eqn: Any, x: View | Deferred) -> list[View | Deferred]:
         """Pieces of an array along an axis, or its entries there."""
