@@ -69,7 +69,9 @@ class _FromStart(eqx.Module):
 
 
 class _Progress(NamedTuple):
-    """Where a solve stands: the start of the next part, what was saved so far, and how the last part ended."""
+    """Where a solve stands: the start of the next part, what was saved so far, and how the last part ended; `level` is the
+    condition at the start of the last part.
+    """
 
     t: Float[Array, ""]
     y: Any
@@ -80,6 +82,7 @@ class _Progress(NamedTuple):
     ys: Any
     stats: Any
     code: Int[Array, ""]
+    level: Float[Array, ""]
 
 
 def solve_with_jumps(
@@ -95,8 +98,8 @@ def solve_with_jumps(
     resolution = float(jnp.finfo(t0.dtype).eps) ** 0.75
     going = int(RESULTS.event_occurred._value)
 
-    def part(p: _Progress) -> tuple[DAESolution, Any]:
-        level = _level_at_start(system, jump.condition, p.t, p.y, p.args, rank)
+    def part(p: _Progress) -> tuple[DAESolution, Any, Any]:
+        level = _level_at_start(system, jump.condition, p.t, p.y, p.args, p.level, rank)
         # A downcrossing, as bisection has to know which way it goes.
         up = {True: -1, False: 1, None: jnp.sign(level)}[jump.direction]
         event = diffrax.Event(
@@ -107,10 +110,10 @@ def solve_with_jumps(
         later = sign * jnp.maximum(sign * wanted, sign * p.t)
         subs = {"wanted": dataclasses.replace(output, t0=False, t1=False, ts=later), "end": diffrax.SubSaveAt(t1=True)}
         one = dataclasses.replace(solve, event=event, saveat=diffrax.SaveAt(subs=subs))
-        return one(system, p.t, t1, dt0, p.y, p.args, rank)
+        return *one(system, p.t, t1, dt0, p.y, p.args, rank), level
 
     def advance(p: _Progress) -> _Progress:
-        sol, consistent = part(p)
+        sol, consistent, level = part(p)
         end, reached = sol.ts["end"][-1], jax.tree.map(lambda y: y[-1], sol.ys["end"])
         here = (sign * wanted >= sign * p.t) & (sign * wanted <= sign * end)
         ts = jnp.where(here, wanted, p.ts)
@@ -127,14 +130,15 @@ def solve_with_jumps(
         )
         times = jnp.where((jnp.arange(jump.most) == p.count) & jumps & ~exhausted, end, p.times)
         code = jnp.where(jumps & exhausted, RESULTS.too_many_jumps._value, code)
-        return _Progress(end, y, args, p.count + (jumps & ~exhausted), times, ts, ys, stats, code)
+        return _Progress(end, y, args, p.count + (jumps & ~exhausted), times, ts, ys, stats, code, level)
 
-    shape = jax.eval_shape(part, _Progress(t0, y0, args, *[None] * 6))[0]
+    unknown = jnp.zeros_like(t0)
+    shape = jax.eval_shape(part, _Progress(t0, y0, args, *[None] * 6, unknown))[0]
     unsaved = jax.tree.map(lambda x: jnp.full(x.shape, jnp.inf, x.dtype), shape.ys["wanted"])
     stats = {k: jnp.zeros((), int) for k in shape.stats if k != "max_steps"}
     start = _Progress(
         t0, y0, args, jnp.zeros((), int), jnp.full(jump.most, jnp.inf, t0.dtype),
-        jnp.full_like(wanted, jnp.inf), unsaved, stats, jnp.asarray(going, RESULTS.successful._value.dtype),
+        jnp.full_like(wanted, jnp.inf), unsaved, stats, jnp.asarray(going, RESULTS.successful._value.dtype), unknown,
     )  # fmt: skip
     kind: Any = "checkpointed" if solve.derivative() == "reverse" else "lax"
     most = {"max_steps": jump.most + 1} if kind == "checkpointed" else {}
@@ -152,12 +156,23 @@ def _after(system: System, jump: Jump, t: Any, y: Any, args: Any) -> tuple[Any, 
     return y, jax.tree.map(lambda x, like: jnp.asarray(x, jnp.result_type(like)), new, args)
 
 
-def _level_at_start(system: System, condition: Callable[..., Any], t: Any, y: Any, args: Any, rank: int | None) -> Any:
-    """The condition at the start of a part; where this is zero, the sign with which it leaves zero."""
+def _level_at_start(
+    system: System, condition: Callable[..., Any], t: Any, y: Any, args: Any, before: Any, rank: int | None
+) -> Any:
+    """The condition at the start of a part; where this is zero, the sign with which it leaves zero. That is the sign with
+    which it came, −`before`, where its rate is not known.
+    """
+    value = jnp.asarray(condition(t, y, args))
+    if not jnp.issubdtype(value.dtype, jnp.floating):
+        raise TypeError(
+            f"`condition` of a Jump must return a real number that crosses zero, but returns {value.dtype}: write y[0] in "
+            "place of y[0] < 0."
+        )
+    # The state as it is: one made anew from the underlying ODE is NaN where the structure allows what the numbers do not.
     z, ode = underlying_ode(system, t, y, args, rank)
     of = lambda t, z: jnp.asarray(condition(t, ode.decode(t, z), args), t.dtype)
-    value, rate = jax.jvp(of, (t, z), (jnp.ones_like(t), ode.field(t, z)))
+    _, rate = jax.jvp(of, (t, z), (jnp.ones_like(t), ode.field(t, z)))
+    rate = jnp.where(jnp.isfinite(rate), rate, -before)
     zero = float(jnp.finfo(t.dtype).eps) ** 0.5 * (1 + jnp.abs(rate))
-    # A rate that is not finite, of a system whose Jacobian is singular, tells nothing.
-    leaves = jnp.abs(value) <= jnp.where(jnp.isfinite(zero), zero, -1)
-    return lax.stop_gradient(jnp.where(leaves, jnp.where(rate >= 0, zero, -zero), value))
+    leaves = (jnp.abs(value) <= zero) & (rate != 0)
+    return lax.stop_gradient(jnp.where(leaves, jnp.where(rate > 0, zero, -zero), value))

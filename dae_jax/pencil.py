@@ -166,17 +166,21 @@ class Pencil(eqx.Module):
         """For a solve from (t, y)."""
         return dataclasses.replace(self, start=jax.lax.stop_gradient(self.rates(t, y)))
 
-    @property
-    def controlled(self) -> np.ndarray:
-        """Which variables are of index 0 or 1."""
-        return np.array(self.outline.indices) <= 1
-
-    def weights(self, h: Any) -> Float[Array, " n"]:
-        """h^(k−1) for a variable of index k > 1: how much of its error counts.
+    def weights(self, h: Any, raised: Any = 1.0) -> Float[Array, " n"]:
+        """h^(k−1) for a variable of index k > 1: how much of its error counts; up to `raised` times that, or h^(k−2), for those
+        that the user sees.
 
         Source: E. Hairer, G. Wanner, *Solving Ordinary Differential Equations II*, VII.3 and the program RADAU5.
         """
-        return powers(jnp.minimum(jnp.abs(h), 1), tuple(max(k - 1, 0) for k in self.outline.indices))
+        size = jnp.minimum(jnp.abs(h), 1)
+        indices = np.array(self.outline.indices)
+        weights = powers(size, tuple(np.maximum(indices - 1, 0).tolist()))
+        seen = (indices > 1) & self.form.shown
+        return weights * jnp.where(seen, jnp.clip(raised, 1, 1 / size), 1) if seen.any() else weights
+
+    def counted(self, dense: bool) -> Bool[np.ndarray, " n"]:
+        """Which variables are of index 0 or 1, or seen by the user where values between steps are wanted."""
+        return (np.array(self.outline.indices) <= 1) | (dense & self.form.shown)
 
 
 def powers(x: Float[Array, ""], exponents: tuple[int, ...]) -> Float[Array, " n"]:

@@ -20,10 +20,12 @@ from .kernels import PullBack, inexact, one_kernel, one_kernel_enabled
 from .linalg import rms_norm
 from .solution import RESULTS, DAESolution, Interpolation, all_finite
 from .solvers import (
+    BDF,
     DOP853,
     AbstractManifoldSolver,
     AbstractResidualSolver,
     OrthogonalProjection,
+    RadauIIA5,
     SelectedResiduals,
     SelectedStates,
     TangentSpace,
@@ -327,8 +329,8 @@ def _on_states(cond: Callable[..., Any], decode: Any, args: Any) -> Callable[...
 
 def _economical(solver: Any, between: bool) -> Any:
     """The solver without what this solve does not need, with its stages written out."""
-    if isinstance(solver, OrthogonalProjection | TangentSpace):
+    if isinstance(solver, OrthogonalProjection | TangentSpace | SelectedResiduals):
         return dataclasses.replace(solver, solver=_economical(solver.solver, between))
-    if isinstance(solver, DOP853):
+    if isinstance(solver, BDF | DOP853 | RadauIIA5):
         return dataclasses.replace(solver, dense=between)
     return unrolled(solver)

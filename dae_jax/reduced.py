@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .constraints import at_one_instant
 from .linalg import take
@@ -42,6 +42,11 @@ class ReducedForm(eqx.Module):
     def variables(self) -> tuple[str, ...]:
         """A name for each unknown."""
         return (*(f"state[{i}]" for i in range(self.ode.orders.size)), *self.ode.form.variables)
+
+    @property
+    def shown(self) -> Bool[np.ndarray, " z"]:
+        """Which unknowns are the user's."""
+        return np.isin(np.arange(self.size), self.ode.orders.places[0][: self.ode.form.layout.size])
 
     @property
     def may_cancel(self) -> bool:

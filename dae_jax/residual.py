@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .constraints import MechanicalODE, at_one_instant
 from .structure.layout import Layout
@@ -68,6 +68,11 @@ class ResidualForm(eqx.Module):
     def size(self) -> int:
         """The number of unknowns."""
         return self.layout.size + self.extra
+
+    @property
+    def shown(self) -> Bool[np.ndarray, " n"]:
+        """Which unknowns are the user's."""
+        return np.arange(self.size) < self.layout.size
 
     @property
     def may_cancel(self) -> bool:

@@ -1,5 +1,6 @@
 """`daesolve`: one solve of a DAE, through `diffrax.diffeqsolve`."""
 
+import functools
 from typing import Any
 
 import diffrax
@@ -16,7 +17,7 @@ from .checks import (
     refuse_no_event,
     takes_residuals,
 )
-from .formulations import AbstractFormulation, Differentiation, DummyDerivatives, ReducedResidual, Residual
+from .formulations import AbstractFormulation, Differentiation, DummyDerivatives, ReducedResidual, Residual, why_not_as_written
 from .jumps import Jump, refuse_other_outputs
 from .program import Program, Solve, run, split
 from .solution import RESULTS, DAESolution
@@ -55,8 +56,9 @@ def daesolve(
     - `t0`, `t1`, `dt0`: start, end and first (or fixed) step; t1 < t0 integrates backwards, with dt0 < 0.
     - `y0`: the state at `t0`: (q, v), (x, z) or y, as the system has it; must satisfy the equations, also the hidden ones.
     - `args`: handed to the system's functions.
-    - `formulation`: which equations are integrated; by default `Differentiation()`, the underlying ODE, and `Residual()`
-      for solvers of 0 = F(t, y, ẏ) such as `RadauIIA5`.
+    - `formulation`: which equations are integrated; by default `Differentiation()`, the underlying ODE; for solvers of
+      0 = F(t, y, ẏ) such as `RadauIIA5`, `Residual()`, or `DummyDerivatives()` where these need not converge for the
+      equations as they are written (an index that is too high, or a null space of ∂F/∂ẏ that changes).
     - `stepsize_controller`: by default fixed steps if `dt0` is given, else `PIDController(rtol=1e-8, atol=1e-8)` (1e-5 in
       float32).
     - `saveat`, `adjoint`, `event`, `max_steps`, `throw`, `progress_meter`: as in diffrax. Functions in `saveat` and
@@ -86,9 +88,19 @@ def prepared(
 ) -> tuple[Solve, Any, Any, Any, Any, Any, Any]:  # fmt: skip
     """The method and (system, t0, t1, dt0, y0, args) of a solve, checked, with the defaults filled in."""
     y0, args = checked(system, t0, t1, dt0, y0, args)
-    if formulation is None:
-        formulation = Residual() if takes_residuals(solver) else Differentiation()
+    if formulation is None and takes_residuals(solver):
+        formulation = _for_residuals(system, t0, y0, args)
+    elif formulation is None:
+        formulation = Differentiation()
     refuse_misfits(system, formulation, solver, t0, y0, args)
+    if isinstance(formulation, Residual) and formulation.variable_index is None:
+        why_not = _why_not_as_written(system, t0, y0, args, formulation, solver.highest_index)
+        if why_not:
+            raise ValueError(
+                f"{type(solver).__name__} is not for these equations as they are written: {why_not}. Use "
+                "`formulation=dae_jax.DummyDerivatives()` (or none), or a solver of the underlying ODE such as "
+                "OrthogonalProjection(DOP853())."
+            )
     if isinstance(formulation, DummyDerivatives) and takes_residuals(solver):
         formulation, solver = ReducedResidual(), SelectedResiduals(solver.rtol, solver.atol, solver=solver)
     elif isinstance(formulation, DummyDerivatives):
@@ -104,6 +116,28 @@ def prepared(
         refuse_other_outputs(saveat)
     solve = Solve(formulation, solver, saveat, stepsize_controller, adjoint, event, max_steps, progress_meter)
     return solve, system, t0, t1, dt0, y0, args
+
+
+def _for_residuals(system: Any, t0: Any, y0: Any, args: Any) -> AbstractFormulation:
+    """The equations as they are written where all their variables are found to the order of the method, or nearly."""
+    return DummyDerivatives() if _why_not_as_written(system, t0, y0, args, Residual(), 2) else Residual()
+
+
+def _why_not_as_written(system: Any, t0: Any, y0: Any, args: Any, formulation: Residual, highest: int) -> str:
+    program, arrays = split((system, t0, y0, args))
+    shapes = tuple(jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)) for x in arrays)
+    return _found_of_structure(program, shapes, formulation.form, highest)
+
+
+@functools.lru_cache(maxsize=256)
+def _found_of_structure(program: Program, shapes: tuple[Any, ...], form: Any, highest: int) -> str:
+    found = []
+
+    def look(arrays: Any) -> None:
+        found.append(why_not_as_written(*program.inputs(arrays), form, highest))
+
+    jax.eval_shape(look, list(shapes))
+    return found[0]
 
 
 def _run_on_numbers(program: Program, arrays: list[Any], inputs: Any) -> DAESolution:

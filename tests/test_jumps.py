@@ -143,3 +143,38 @@ def test_refusals():
     away = dae_jax.Jump(lambda t, y, e, **_: y[0][1], lambda t, y, e: ((y[0] * jnp.nan, y[1]), e))
     sol = dae_jax.daesolve(BALL, diffrax.Tsit5(), 0.0, 2.0, None, RELEASED, 0.9, event=away, throw=False)
     assert sol.result == dae_jax.RESULTS.inconsistent_start
+
+
+def held_or_pulled(t, y, yd, held):
+    """A mass on a spring, drawn at a constant speed while `held` is 1, by a constant force while it is 0."""
+    return [yd["x"] - y["v"], yd["v"] + 10 * y["x"] - y["f"], held * (y["v"] - 0.5) + (1 - held) * (y["f"] - 4)]
+
+
+@pytest.mark.parametrize("solver", [dae_jax.RadauIIA5(), dae_jax.BDF()], ids=["radau", "bdf"])
+def test_a_condition_on_an_algebraic_variable_that_the_structure_does_not_give(solver):
+    """f = 10 x = 5 t while it is held: at f = 5.886 it lets go, and swings until its speed is 0.5 again."""
+    zero = jnp.zeros(())
+    start = {"x": zero, "v": zero + 0.5, "f": zero}
+    solve = lambda event: dae_jax.daesolve(
+        dae_jax.ImplicitDAE(held_or_pulled), solver, 0.0, 3.0, None, start, 1.0, event=event
+    )
+    passed = solve(dae_jax.Jump(lambda t, y, held, **_: 5.886 - y["f"], lambda t, y, held: (y, held)))
+    assert passed.stats["jumps"] == 1
+    np.testing.assert_allclose(passed.stats["jump_times"][0], 1.1772, atol=1e-7)
+    np.testing.assert_allclose(passed.ys["f"], 15.0, atol=1e-6)
+
+    condition = lambda t, y, held, **_: jnp.where(held > 0.5, 5.886 - y["f"], 0.5 - y["v"])
+    jump = lambda t, y, held: ({**y, "f": jnp.where(held > 0.5, 4.0, y["f"])}, 1 - held)
+    switched = solve(dae_jax.Jump(condition, jump))
+    # x − 0.4 turns by the angle ω t in the plane of (x − 0.4, v/ω), from (0.1886, 0.5/ω) until v is 0.5 again: the arc
+    # that is left of a full turn.
+    omega, at = np.sqrt(10), 5.886 / 10 - 0.4
+    arc = 2 * np.pi - 2 * np.arctan2(at, 0.5 / omega)
+    np.testing.assert_allclose(switched.stats["jump_times"][:2], [1.1772, 1.1772 + arc / omega], atol=2e-6)
+    assert switched.stats["jumps"] == 2
+
+
+def test_a_condition_is_a_number_that_crosses_zero():
+    event = dae_jax.Jump(lambda t, y, args, **_: y[0][1] < 0, lambda t, y, args: (y, args))
+    with pytest.raises(TypeError, match=r"real number that crosses zero, but returns bool"):
+        dae_jax.daesolve(BALL, diffrax.Tsit5(), 0.0, 1.0, None, RELEASED, event=event)

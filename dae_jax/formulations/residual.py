@@ -12,8 +12,6 @@ from ..systems import ConstrainedSystem
 from .differentiation import AbstractFormulation
 
 
-HIGHEST = 3
-
 
 class Residual(AbstractFormulation):
     """No equation is differentiated by hand: 0 = F(t, y, ẏ), for `RadauIIA5` and `BDF`.
@@ -23,7 +21,8 @@ class Residual(AbstractFormulation):
     - `form`: for a `ConstrainedSystem`, "index-3", "index-2" or "GGL" (see `ResidualForm` for the equations); other
       systems are taken as they are.
     - `variable_index`: the index of each unknown, in the order of `ResidualForm.variables`. The error of a variable of
-      index k counts with h^(k−1) in step-size control. By default found by structural analysis.
+      index k counts with h^(k−1) in step-size control. By default found by structural analysis. Where it is given, the
+      equations are taken as they are also where a solver need not converge for them.
     """
 
     form: Form = eqx.field(static=True, default="GGL")
@@ -52,13 +51,6 @@ class Residual(AbstractFormulation):
             multipliers = ode.multipliers(t, ode.encode(state))
             y = jnp.concatenate([y[: form.layout.size], multipliers, jnp.zeros(form.extra - multipliers.size, y.dtype)])
         pencil = Pencil.of(form, y, self.variable_index)
-        beyond = [name for name, k in zip(form.variables, pencil.outline.indices, strict=True) if k > HIGHEST]
-        if beyond:
-            raise ValueError(
-                f"The index of {', '.join(beyond)} is {max(pencil.outline.indices)}, and methods that take the equations "
-                f"as they are written converge for an index up to {HIGHEST} only. Solve the underlying ODE: "
-                "OrthogonalProjection(DOP853())."
-            )
         return y, pencil.starting(t, y)
 
     def field(self, t: Any, y: Any, ode: Any) -> Any:

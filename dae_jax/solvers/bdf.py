@@ -48,9 +48,11 @@ class NewtonPolynomial(diffrax.AbstractLocalInterpolation):
         if t1 is not None:
             return self.evaluate(t1) - self.evaluate(t0)
         psi = jnp.where(self.psi == 0, 1, self.psi)
+        # After a jump in time diffrax asks for a point that is before the step by round-off.
+        inside = jnp.clip(t0, self.t0, self.t1)
         y = self.phi[MAX_ORDER]
         for j in reversed(range(MAX_ORDER)):
-            distance = t0 - self.t1 + (self.psi[j - 1] if j else 0)
+            distance = inside - self.t1 + (self.psi[j - 1] if j else 0)
             y = self.phi[j] + distance / psi[j] * y
         return y
 
@@ -86,6 +88,7 @@ class _Step(NamedTuple):
     c: Any
     y: Float[Array, " n"]
     rate: Float[Array, " n"]
+    dense: bool
 
     def residual(self, y: Float[Array, " n"]) -> Float[Array, " n"]:
         """F at the new point."""
@@ -125,6 +128,9 @@ class BDF(AbstractResidualSolver):
     363–396, for the choice of the order.
     """
 
+    dense: bool = True
+
+    highest_index = 2
     interpolation_cls = NewtonPolynomial
 
     def order(self, terms: Any) -> int:
@@ -135,7 +141,7 @@ class BDF(AbstractResidualSolver):
 
     def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> _State:
         sign = clock(terms, t0, t1)
-        like = _Step(args, sign, t1, t1 - t0, 1 / (t1 - t0), y0, y0)
+        like = _Step(args, sign, t1, t1 - t0, 1 / (t1 - t0), y0, y0, self.dense)
         factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda: like.factor(y0)[0]))
         return _start(sign * args.start, factors)
 
@@ -158,7 +164,7 @@ class BDF(AbstractResidualSolver):
         y1, (newton, factors, pivot) = implicit_root(
             lambda y, params: params[0].residual(y),
             lambda params: _solve(*params),
-            (_Step(args, sign, t1, h, method.c, y, rate), *constant((y0, state, is_smallest(t0, t1))), tol),
+            (_Step(args, sign, t1, h, method.c, y, rate, self.dense), *constant((y0, state, is_smallest(t0, t1))), tol),
             linear_solve=lambda inverse, b: inverse(b),
             jacobian=lambda y, params: functools.partial(params[0].pencil.solve, params[0].factor(y)[0]),
         )
@@ -168,7 +174,7 @@ class BDF(AbstractResidualSolver):
             phi.append(jnp.where(j <= k, phi[-1] + star[j], phi[-1]))
         change, *phi = [phi[0], *reversed(phi[1:])]
 
-        scale = args.controlled / tol.scale(y0, y1)
+        scale = args.weights(h, tol.raised(self.dense)) * args.counted(self.dense) / tol.scale(y0, y1)
         size = lambda row: rms_norm(constant(row * scale))
         sizes = [size(row) for row in phi]
         higher = size(change - _at(star, k + 1))
@@ -187,7 +193,8 @@ class BDF(AbstractResidualSolver):
             *constant((factors, method.c, newton.eta)),
         )  # fmt: skip
         new = jax.tree.map(lambda a, b: jnp.where(jumped, a, b), _start(jnp.zeros_like(y1), new.factors), new)
-        used = jnp.stack([jnp.where(j <= k, 1, 0) for j in ROWS])[:, None]
+        # In a step that a jump is in, the value is that after it.
+        used = jnp.stack([jnp.where(j <= jnp.where(jumped, 0, k), 1, 0) for j in ROWS])[:, None]
         return y1, error, {"phi": jnp.where(used, phi, 0), "psi": method.psi}, new, result
 
 
@@ -242,7 +249,7 @@ def _solve(step: _Step, y0: Any, state: _State, smallest: Any, tol: Tolerances) 
     """y at t₁, and how it was found: with the factors at hand first, with new ones where these fail, and in the smallest
     step with new ones for each correction.
     """
-    scale = step.pencil.weights(step.h) / tol.scale(y0)
+    scale = step.pencil.weights(step.h, tol.raised(step.dense)) / tol.scale(y0)
     changed = jnp.abs(step.c - state.c) > ALIKE * step.c
 
     def attempt(carry: Any) -> Any:

@@ -15,6 +15,8 @@ POLYNOMIAL = np.linalg.inv(_POWERS)
 
 # A: ∫₀^cᵢ of the Lagrange polynomials of the nodes.
 _LAGRANGE = np.linalg.inv(NODES[:, None] ** np.arange(3))
+# The value at the start of the polynomial through the stages alone.
+AT_START = _LAGRANGE[0]
 TABLEAU = (_POWERS / np.arange(1, 4)) @ _LAGRANGE
 INVERSE = np.linalg.inv(TABLEAU)
 
@@ -29,3 +31,7 @@ BACK = np.linalg.inv(TRANSFORM)
 
 # The embedded formula of order 3, ŷ₁ − y₁ = γ₀ (h ẏ₀ + Σ eᵢ zᵢ) with γ₀ = 1/γ (eq. IV.8.19).
 ERROR = np.array([-(13 + 7 * ROOT), -13 + 7 * ROOT, -1.0]) / 3
+
+# The largest value of |s (s − c₁)(s − c₂)(s − 1)| in a step.
+_PLACES = np.linspace(0, 1, 1001)
+BETWEEN = float(np.abs(_PLACES * np.prod(_PLACES[:, None] - NODES, 1)).max())

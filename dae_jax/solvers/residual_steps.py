@@ -16,6 +16,8 @@ from ..linalg import rms_norm, roundoff
 
 # The part of the tolerance that round-off may use up (BCP, section 5.2.2).
 NOISE = 0.33
+# Round-off of the divided differences of algebraic variables, in parts of the variables over h.
+NOISY = 1000
 # Where algebraic variables jump, Newton's method with a Jacobian of its own for each of its corrections.
 FULL = 30
 
@@ -29,6 +31,9 @@ class AbstractResidualSolver(diffrax.AbstractAdaptiveSolver):
 
     rtol: Any = None
     atol: Any = None
+
+    # Up to which index the method converges.
+    highest_index: eqx.AbstractClassVar[int]
 
     term_structure = diffrax.ODETerm
 
@@ -52,6 +57,15 @@ class Tolerances(NamedTuple):
     roundoff: Any
     corrections: int
     patient: bool
+
+    def raised(self, dense: bool) -> Any:
+        """How much more than that at the ends of steps the error of variables of index 2 and higher counts, where values
+        between steps are wanted: their round-off grows with the same power of 1/h.
+        """
+        if not dense:
+            return 1.0
+        smallest = jnp.max(self.rtol) + jnp.max(self.atol)
+        return smallest / (NOISY * jnp.finfo(smallest.dtype).eps)
 
     def scale(self, *ys: Float[Array, " n"]) -> Float[Array, " n"]:
         """The error that is allowed in each variable."""
@@ -120,7 +134,7 @@ def simplified_newton(
         size = rms_norm(dx * scale)
         theta = size / jnp.maximum(s.last, jnp.finfo(start.dtype).tiny)
         first = s.count == 0
-        eta = jnp.where(first, jnp.maximum(s.eta, epsilon) ** 0.8, theta / jnp.maximum(1 - theta, epsilon))
+        eta = jnp.where(first, jnp.maximum(s.eta, 1e-3) ** 0.8, theta / jnp.maximum(1 - theta, epsilon))
         remaining = corrections - 1 - s.count
         stagnant = ~first & (theta >= 1)
         hopeless = stagnant | (eta * size * theta**remaining > tol.newton) & (size > NOISE)

@@ -47,6 +47,8 @@ class SelectedResiduals(AbstractResidualSolver):
 
     solver: AbstractResidualSolver = dataclasses.field(kw_only=True)
 
+    highest_index = 1
+
     @property
     def interpolation_cls(self) -> Any:
         return self.solver.interpolation_cls

@@ -1,0 +1,47 @@
+"""Whether a solver of residuals keeps its order on the equations as they are written."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import structural_rank
+
+from ..offsets import find_offsets
+from ..residual import Form, ResidualForm
+from ..structure import interpreted
+
+
+def why_not_as_written(system: Any, t: Any, state: Any, args: Any, form: Form, highest: int) -> str:
+    """Why a method that converges for an index up to `highest` need not on the equations as they are written; empty where it
+    does. Found while tracing.
+
+    From index 2 on, the null space of ∂F/∂ẏ must be constant, or the method may be unstable, however small the step. It
+    counts as constant where ∂F/∂ẏ is, and where as many rows of it are independent as there are variables whose derivative
+    occurs, as in Hessenberg form.
+
+    Source: C. W. Gear, L. R. Petzold, SIAM J. Numer. Anal. 21 (1984), 716–728, for what happens otherwise; E. Hairer, C.
+    Lubich, M. Roche, *The Numerical Solution of Differential-Algebraic Systems by Runge–Kutta Methods*, ch. 4 to 6.
+    """
+    residual = ResidualForm.of(system, t, state, args, form)
+    dtype = jnp.result_type(*jax.tree.leaves(state))
+    try:
+        found = find_offsets(residual, dtype)
+    except NotImplementedError:
+        # A primitive that structural analysis does not know: nothing is known of the index.
+        return ""
+    if found.index > highest:
+        beyond = [name for name, k in zip(residual.variables, found.indices, strict=True) if k > highest]
+        return f"the index of {', '.join(beyond)} is {found.index}, and it converges for an index up to {highest}"
+    occurs = found.by_rate.any(0)
+    if found.index < 2 or structural_rank(csr_array(found.by_rate)) == occurs.sum():
+        return ""
+    y, time = jax.ShapeDtypeStruct((residual.size,), dtype), jax.ShapeDtypeStruct((), dtype)
+    on, _ = interpreted(jax.jacfwd(residual.residual, 2), time, y, y, derivative=True)
+    if not np.concatenate(on, 1).any():
+        return ""
+    return (
+        f"the index is {found.index}, and there are fewer equations with derivatives than variables whose derivative occurs, "
+        "in combinations that change, for which it may be unstable"
+    )
