@@ -17,7 +17,14 @@ from .checks import (
     refuse_no_event,
     takes_residuals,
 )
-from .formulations import AbstractFormulation, Differentiation, DummyDerivatives, ReducedResidual, Residual, why_not_as_written
+from .formulations import (
+    AbstractFormulation,
+    Differentiation,
+    DummyDerivatives,
+    ReducedResidual,
+    Residual,
+    why_not_as_written,
+)
 from .jumps import Jump, refuse_other_outputs
 from .program import Program, Solve, run, split
 from .solution import RESULTS, DAESolution

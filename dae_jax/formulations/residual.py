@@ -12,7 +12,6 @@ from ..systems import ConstrainedSystem
 from .differentiation import AbstractFormulation
 
 
-
 class Residual(AbstractFormulation):
     """No equation is differentiated by hand: 0 = F(t, y, ẏ), for `RadauIIA5` and `BDF`.
 

@@ -29,11 +29,11 @@ class AbstractResidualSolver(diffrax.AbstractAdaptiveSolver):
     round-off for fixed steps.
     """
 
-    rtol: Any = None
-    atol: Any = None
-
     # Up to which index the method converges.
     highest_index: eqx.AbstractClassVar[int]
+
+    rtol: Any = None
+    atol: Any = None
 
     term_structure = diffrax.ODETerm
 
