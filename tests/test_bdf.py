@@ -184,3 +184,21 @@ def test_nan_is_an_error():
     system = dae_jax.ImplicitDAE(lambda t, y, yd, args: yd - jnp.where(t > 0.5, jnp.nan, -y))
     sol = solve(system, jnp.ones(1), 1.0, 1e-6, throw=False)
     assert sol.result == dae_jax.RESULTS.no_convergence
+
+
+@pytest.mark.parametrize("tolerance", [1e-6, 1e-8])
+def test_the_order_rises_where_a_longer_step_fails(tolerance):
+    """The problem of `hessenberg_2` with ν = 50: a change of size or order disturbs the differential variables."""
+    nu = 50.0
+
+    def f(t, x, z, args):
+        e = jnp.exp(t)
+        first = (nu - 1 / (2 - t)) * x[0] + (2 - t) * nu * z[0] + (3 - t) / (2 - t) * e
+        return jnp.stack([first, (1 - nu) / (t - 2) * x[0] - x[1] + (nu - 1) * z[0] + 2 * e])
+
+    scene = SCENES["hessenberg-2"]()
+    sol = dae_jax.daesolve(
+        dae_jax.SemiExplicitDAE(f, scene.system.g), dae_jax.BDF(), 0.0, 1.0, None, scene.y0, max_steps=500,
+        stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
+    )  # fmt: skip
+    np.testing.assert_allclose(sol.ys[0][-1], np.exp([1.0, 1.0]), rtol=5 * tolerance)

@@ -31,6 +31,8 @@ ROWS = range(MAX_ORDER + 1)
 SIGNIFICANT = 0.01
 # Step sizes that differ by less, relatively, are the same.
 ALIKE = 1e-6
+# A step that is shorter than was wanted, by more than what is left of an interval is shared out by.
+LESS = 0.9
 # The part of the step-size controller in h_new = h · SAFETY · error^(−1 / ERROR_ORDER).
 SAFETY, ERROR_ORDER = 0.9, 2
 
@@ -62,8 +64,9 @@ class _State(NamedTuple):
 
     `phi`: modified divided differences φ₁ ... φ₅ at tₙ; `psi`: tₙ − tₙ₋₁, tₙ − tₙ₋₂, ...; `steps`: how many were taken since
     the start or a jump; `order` of the next step; `used`: that of the last; `alike`: how many steps had this size and
-    order; `rising`: the order has risen with every step so far; `factors` of ∂F/∂y + c ∂F/∂ẏ, and the c they were made
-    for; `eta`: θ/(1 − θ) of Newton's method.
+    order; `rising`: the order has risen with every step so far; `wanted`: the size that the next step should have, more than
+    it has where a step failed between; `held`: the size is not to be doubled yet; `factors` of ∂F/∂y + c ∂F/∂ẏ, and the c
+    they were made for; `eta`: θ/(1 − θ) of Newton's method.
     """
 
     phi: Float[Array, "5 n"]
@@ -73,6 +76,8 @@ class _State(NamedTuple):
     used: Int[Array, ""]
     alike: Int[Array, ""]
     rising: Bool[Array, ""]
+    wanted: Float[Array, ""]
+    held: Bool[Array, ""]
     factors: Any
     c: Float[Array, ""]
     eta: Float[Array, ""]
@@ -179,17 +184,18 @@ class BDF(AbstractResidualSolver):
         sizes = [size(row) for row in phi]
         higher = size(change - _at(star, k + 1))
         alike = jnp.where(method.constant & (k == state.used), state.alike, 0) + 1
-        decision = _decision(constant(method), state, alike, size(change), sizes, higher)
+        held = (h < LESS * state.wanted) | (state.held & (alike <= k + 1))
+        decision = _decision(constant(method), state, alike, held, size(change), sizes, higher)
         # What is algebraic may jump, and the history with it.
         smooth = method.tail * size(change * args.outline.differential) < 1
-        jumped = constant(is_smallest(t0, t1) & newton.converged & (decision.error >= 1) & smooth)
-        decision = decision._replace(error=jnp.where(jumped, (2 / SAFETY) ** -ERROR_ORDER, decision.error))
-        error = jnp.where(newton.converged, decision.error, jnp.inf) * tol.scale(y0, y1)
-        failure = of_step(newton.converged, pivot, y0.size, decision.error)
+        jumped = constant(is_smallest(t0, t1) & newton.converged & (decision.factor < SAFETY) & smooth)
+        error = (jnp.where(jumped, 2, decision.factor) / SAFETY) ** -ERROR_ORDER
+        failure = of_step(newton.converged, pivot, y0.size, error)
+        error = jnp.where(newton.converged, error, jnp.inf) * tol.scale(y0, y1)
         y1, error, result = at_the_floor(failure, t0, t1, y0, y1, constant(error))
         phi = jnp.stack(phi)
         new = _State(
-            phi[1:], method.psi, state.steps + 1, decision.order, k, alike, decision.rising,
+            phi[1:], method.psi, state.steps + 1, decision.order, k, alike, decision.rising, decision.factor * h, held,
             *constant((factors, method.c, newton.eta)),
         )  # fmt: skip
         new = jax.tree.map(lambda a, b: jnp.where(jumped, a, b), _start(jnp.zeros_like(y1), new.factors), new)
@@ -203,7 +209,8 @@ def _start(rates: Float[Array, " n"], factors: Any) -> _State:
     zero, count = jnp.zeros((), rates.dtype), jnp.zeros((), int)
     phi = jnp.stack([rates] + [jnp.zeros_like(rates)] * (MAX_ORDER - 1))
     return _State(
-        phi, jnp.ones(len(ROWS), rates.dtype), count, count + 1, count, count, count == 0, factors, zero, zero + 1
+        phi, jnp.ones(len(ROWS), rates.dtype), count, count + 1, count, count, count == 0, zero, count > 0, factors, zero,
+        zero + 1,
     )
 
 
@@ -274,16 +281,20 @@ def _solve(step: _Step, y0: Any, state: _State, smallest: Any, tol: Tolerances) 
 
 
 class _Decision(NamedTuple):
-    error: Any
+    """The next size in parts of this one, less than SAFETY for a step that fails, and the next order."""
+
+    factor: Any
     order: Any
     rising: Any
 
 
-def _decision(method: _Formula, state: _State, alike: Any, change: Any, sizes: list[Any], higher: Any) -> _Decision:
-    """The next order, that with the least term hʲ y⁽ʲ⁾ of the series, and the error that leads to the next size.
+def _decision(
+    method: _Formula, state: _State, alike: Any, held: Any, change: Any, sizes: list[Any], higher: Any
+) -> _Decision:
+    """The next order is that with the least term hʲ y⁽ʲ⁾ of the series.
 
     At the start, order and size rise with each step; later the order rises after k + 1 steps of one size and order, and
-    the size where it can be doubled.
+    the size where it can be doubled, unless it is `held`: where it was doubled and the step failed, the order comes first.
     """
     k = state.order
     errors = _at(method.sigma, k - 1) * _at(sizes, k), _at(method.sigma, k) * change, higher / (k + 2)
@@ -292,6 +303,7 @@ def _decision(method: _Formula, state: _State, alike: Any, change: Any, sizes: l
     falls = jnp.where(k > 2, jnp.maximum(low, lowest) <= here, (k == 2) & (low <= here / 2))
     # The points of a lower order bend where the order rose, and at the start the differences are round-off.
     falls = falls & (k <= state.used) & (~state.rising | (here > SIGNIFICANT))
+    falls = falls & ((alike > k + 1) | (method.tail * change >= 1) | state.rising)
     rising = state.rising & ~falls & (k < MAX_ORDER)
     settled = ~rising & (alike > k + 1) & (k - state.used != 1) & (k < MAX_ORDER)
     falls = falls | (settled & (k > 1) & (low <= jnp.minimum(here, high)))
@@ -302,6 +314,6 @@ def _decision(method: _Formula, state: _State, alike: Any, change: Any, sizes: l
     exponent = (jnp.where(accepted, order, k) + 1).astype(expected.dtype)
     ratio = (2 * expected + 1e-4) ** (-1 / exponent)
     # An accepted step is followed by one of its size exactly, or by one of twice its size.
-    double = (ratio >= 2) & ~rising | rising & rises
+    double = (ratio >= 2) & ~rising & ~held | rising & rises
     factor = jnp.where(accepted, jnp.where(double, 2, 0.95), jnp.clip(0.9 * ratio, 0.25, 0.89))
-    return _Decision((factor / SAFETY) ** -ERROR_ORDER, order, rising)
+    return _Decision(factor, order, rising)
