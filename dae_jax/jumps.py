@@ -9,6 +9,7 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix
 from jax import lax
 from jaxtyping import Array, Float, Int
@@ -16,8 +17,10 @@ from jaxtyping import Array, Float, Int
 from .checks import saved_parts
 from .initialise import consistent_state
 from .solution import RESULTS, DAESolution
+from .states import NUMBERS, brief, broadcast_to_state, describe
 from .systems import System
 from .underlying import underlying_ode
+from .user_functions import refuse_other_arguments, returned
 
 
 class Jump(eqx.Module):
@@ -45,6 +48,52 @@ class Jump(eqx.Module):
     direction: bool | None = eqx.field(static=True, default=None)
     fixed: Any = None
     most: int = eqx.field(static=True, default=100)
+
+    def __check_init__(self) -> None:
+        for name in ("condition", "jump"):
+            if not callable(getattr(self, name)):
+                raise TypeError(f"`{name}` of Jump must be a function, but is {brief(getattr(self, name))}.")
+        if self.direction not in (None, True, False):
+            raise ValueError(
+                "`direction` of Jump must be True for upcrossings, False for downcrossings or None for both, but is "
+                f"{brief(self.direction)}."
+            )
+        if type(self.most) is not int or self.most < 1:
+            raise ValueError(f"`most` of Jump must be an integer of at least 1, but is {brief(self.most)}.")
+
+
+def refuse_wrong_event(event: Any, t: Any, y: Any, args: Any) -> None:
+    """Refuses functions of an event that cannot be called with (t, y, args), or do not return what they must."""
+    if event is None:
+        return
+    conditions = [event.condition] if isinstance(event, Jump) else jax.tree.leaves(event.cond_fn, is_leaf=callable)
+    for condition in conditions:
+        _refuse_wrong_condition(condition, t, y, args)
+    if isinstance(event, Jump):
+        _refuse_wrong_jump(event, t, y, args)
+
+
+def _refuse_wrong_condition(condition: Any, t: Any, y: Any, args: Any) -> None:
+    refuse_other_arguments("condition(t, y, args, **kwargs)", condition, 3, terms=None, solver=None, t0=None, t1=None)
+    found = returned("condition(t, y, args, **kwargs)", condition, t, y, args)
+    fits = isinstance(found, NUMBERS) and jnp.shape(found) == ()
+    if not fits or np.dtype(jnp.result_type(found)).kind not in "fb":
+        raise ValueError(
+            "`condition(t, y, args, **kwargs)` must return a real number, whose zero is the event, but returns "
+            f"{describe(found)}."
+        )
+
+
+def _refuse_wrong_jump(event: Jump, t: Any, y: Any, args: Any) -> None:
+    found = returned("jump(t, y, args)", event.jump, t, y, args)
+    shapes = lambda tree: (jax.tree.structure(tree), [jnp.shape(x) for x in jax.tree.leaves(tree)])
+    if not isinstance(found, tuple | list) or len(found) != 2 or shapes(tuple(found)) != shapes((y, args)):
+        raise ValueError(
+            f"`jump(t, y, args)` must return (y, args), the state and the args to go on with, {describe((y, args))}, but "
+            f"returns {describe(found)}."
+        )
+    if event.fixed is not None:
+        broadcast_to_state("fixed", event.fixed, y, "booleans")
 
 
 def refuse_other_outputs(saveat: diffrax.SaveAt) -> None:

@@ -15,7 +15,7 @@ import optimistix
 from .checks import is_saved_part, saved_parts
 from .formulations import AbstractFormulation, Residual
 from .initialise import start_is_as_expected
-from .jumps import Jump, solve_with_jumps
+from .jumps import Jump, refuse_wrong_event, solve_with_jumps
 from .kernels import PullBack, inexact, one_kernel, one_kernel_enabled
 from .linalg import rms_norm
 from .solution import RESULTS, DAESolution, Interpolation, all_finite
@@ -33,6 +33,7 @@ from .solvers import (
 )
 from .solvers.tangent_space import TangentPoint
 from .tape import Taped, as_it_is, can_be_taped, cotangents, recorded, saved_times
+from .user_functions import refuse_wrong_functions, returned
 
 
 class Program(NamedTuple):
@@ -78,6 +79,7 @@ class _Split(eqx.Module):
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def _jitted(program: Program, rank: int | None, arrays: list[Any]) -> Any:
     solve, *inputs = program.inputs(jax.tree.map(jnp.asarray, arrays))
+    solve.refuse_wrong_functions(*inputs)
     sol, as_expected = (
         (solve_with_jumps(solve, *inputs, rank)) if isinstance(solve.event, Jump) else solve(*inputs, rank)
     )
@@ -141,6 +143,13 @@ class Solve(eqx.Module):
         # A yes or no has no derivative.
         consistent, as_expected = one_kernel(check, self.derivative())(jax.lax.stop_gradient(check_arrays))
         return self._solution(out.whole(), args, rank, consistent), as_expected
+
+    def refuse_wrong_functions(self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any) -> None:
+        """Refuses functions of the user that do not take or return what they must, in a sentence."""
+        refuse_wrong_functions(system, t0, y0, args)
+        refuse_wrong_event(self.event, t0, y0, args)
+        for part in saved_parts(self.saveat):
+            returned("saveat.fn(t, y, args)", part.fn, t0, y0, args)
 
     def _check(
         self, system: Any, t0: Any, y0: Any, args: Any, rank: int | None

@@ -7,17 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .checks import (
-    as_array,
-    checked,
-    refuse_bad_start,
-    refuse_bad_times,
-    refuse_misfits,
-    refuse_no_event,
-    takes_residuals,
-)
+from .checks import as_array, checked, refuse_bad_start, refuse_bad_times
 from .formulations import AbstractFormulation, Differentiation, DummyDerivatives, ReducedResidual, Residual
 from .jumps import Jump, refuse_other_outputs
+from .options import refuse_misfits, refuse_no_event, refuse_other_steps, refuse_wrong_options, takes_residuals
 from .program import Program, Solve, run, split
 from .solution import RESULTS, DAESolution
 from .solvers import SelectedResiduals, SelectedStates
@@ -86,16 +79,18 @@ def prepared(
 ) -> tuple[Solve, Any, Any, Any, Any, Any, Any]:  # fmt: skip
     """The method and (system, t0, t1, dt0, y0, args) of a solve, checked, with the defaults filled in."""
     y0, args = checked(system, t0, t1, dt0, y0, args)
+    refuse_wrong_options(saveat, stepsize_controller, adjoint, event, max_steps, progress_meter)
     if formulation is None:
         formulation = Residual() if takes_residuals(solver) else Differentiation()
     refuse_misfits(system, formulation, solver, t0, y0, args)
+    refuse_other_steps(solver, stepsize_controller, dt0)
     if isinstance(formulation, DummyDerivatives) and takes_residuals(solver):
         formulation, solver = ReducedResidual(), SelectedResiduals(solver.rtol, solver.atol, solver=solver)
     elif isinstance(formulation, DummyDerivatives):
         solver = SelectedStates(solver)
     dtype = jnp.result_type(*jax.tree.leaves(y0))
     if stepsize_controller is None:
-        stepsize_controller = _default_controller(solver, dt0, dtype)
+        stepsize_controller = _default_controller(dt0, dtype)
     t0, t1, dt0 = (x if x is None else as_array(x, dtype) for x in (t0, t1, dt0))
     saveat = jax.tree.map(lambda x: as_array(x, dtype) if isinstance(x, np.ndarray | jax.Array) else x, saveat)
     if event is not None:
@@ -121,11 +116,9 @@ def _run_on_numbers(program: Program, arrays: list[Any], inputs: Any) -> DAESolu
     return sol
 
 
-def _default_controller(solver: Any, dt0: Any, dtype: Any) -> Any:
+def _default_controller(dt0: Any, dtype: Any) -> Any:
     if dt0 is not None:
         return diffrax.ConstantStepSize()
-    if not isinstance(solver, diffrax.AbstractAdaptiveSolver):
-        raise ValueError(f"`dt0` must be given: {type(solver).__name__} takes fixed steps.")
     return _PID64 if dtype == jnp.float64 else _PID32
 
 

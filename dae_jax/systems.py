@@ -54,6 +54,11 @@ class ConstrainedSystem(eqx.Module):
                 "A ConstrainedSystem needs a `constraint` or a `nonholonomic` constraint; "
                 "without either it is an ODE, which `diffrax.diffeqsolve` solves."
             )
+        if self.rank is not None and (type(self.rank) is not int or self.rank < 1):
+            raise ValueError(
+                "`rank` must be how many of the constraints are independent, an integer of at least 1, or None for all of "
+                f"them, but is {self.rank!r}."
+            )
 
     def mass_matrix(self, q: Any, args: Any = None) -> Float[Array, "n n"] | Float[Array, " n"] | None:
         """M at `q`: `None` for unit masses, a vector if diagonal, else a matrix."""

@@ -1,8 +1,11 @@
 """Baumgarte's stabilisation (Pöll, Hafner and Heinzl, sec. 2.2)."""
 
+import math
 from typing import Any
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ..constraints import ManifoldODE
@@ -30,6 +33,11 @@ class Baumgarte(AbstractFormulation):
     beta: Float[ArrayLike, ""]
 
     def __init__(self, alpha: Float[ArrayLike, ""], beta: Float[ArrayLike, ""]) -> None:
+        for name, value in (("alpha", alpha), ("beta", beta)):
+            if not isinstance(value, jax.Array | np.ndarray | np.generic | float | int) or isinstance(value, bool):
+                raise TypeError(f"`{name}` of Baumgarte must be a number in 1/s, but is {value!r}.")
+            if isinstance(value, float) and not math.isfinite(value):
+                raise ValueError(f"`{name}` of Baumgarte must be finite, but is {value}.")
         # Arrays, so that another value is not another compilation.
         self.alpha = jnp.asarray(alpha, jnp.result_type(float, alpha))
         self.beta = jnp.asarray(beta, jnp.result_type(float, beta))

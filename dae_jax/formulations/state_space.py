@@ -36,6 +36,10 @@ class StateSpace(AbstractFormulation):
     chart: Callable[..., Any]
     guess: Any = None
 
+    def __check_init__(self) -> None:
+        if not callable(self.chart):
+            raise TypeError(f"`chart` of StateSpace must be a function from coordinates z to q, but is {self.chart!r}.")
+
     def encode(
         self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None
     ) -> tuple[Any, "ChartODE"]:
