@@ -110,13 +110,13 @@ def solve_with_jumps(
         return one(system, p.t, t1, dt0, p.y, p.args, rank)
 
     def advance(p: _Progress) -> _Progress:
-        sol, consistent = part(p)
+        sol, _ = part(p)
         end, reached = sol.ts["end"][-1], jax.tree.map(lambda y: y[-1], sol.ys["end"])
         here = (sign * wanted >= sign * p.t) & (sign * wanted <= sign * end)
         ts = jnp.where(here, wanted, p.ts)
         ys = jax.tree.map(lambda a, b: jnp.where(here.reshape(-1, *(1,) * (a.ndim - 1)), a, b), sol.ys["wanted"], p.ys)
         stats = {k: p.stats[k] + v for k, v in sol.stats.items() if k != "max_steps"}
-        code = jnp.where(consistent, sol.result._value, RESULTS.inconsistent_start._value)
+        code = sol.result._value
         # Jumps so close that their order is round-off are no events any more.
         piled = (p.count > 0) & (sign * (end - p.t) <= 16 * resolution * (1 + jnp.abs(end)))
         jumps, exhausted = code == going, piled | (p.count >= jump.most)
@@ -142,7 +142,8 @@ def solve_with_jumps(
     stats = {"max_steps": solve.max_steps, **p.stats, "jumps": p.count, "jump_times": p.times}
     result = eqx.tree_at(lambda r: r._value, RESULTS.successful, p.code)
     sol = DAESolution(t0, t1, p.ts, p.ys, None, stats, result, None, args, rank)
-    return sol, p.code != RESULTS.inconsistent_start._value
+    refused = (RESULTS.inconsistent_start, RESULTS.dependent_constraints, RESULTS.irregular_mass)
+    return sol, ~jnp.any(jnp.stack([p.code == code._value for code in refused]))
 
 
 def _after(system: System, jump: Jump, t: Any, y: Any, args: Any) -> tuple[Any, Any]:

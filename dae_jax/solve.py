@@ -18,13 +18,14 @@ from .checks import (
 )
 from .formulations import AbstractFormulation, Differentiation, DummyDerivatives, ReducedResidual, Residual
 from .jumps import Jump, refuse_other_outputs
+from .normals import Rank
 from .program import Program, Solve, run, split
 from .solution import RESULTS, DAESolution
 from .solvers import SelectedResiduals, SelectedStates
 from .systems import System
 
 
-_ranks: dict[Program, int | None] = {}
+_ranks: dict[Program, Rank | None] = {}
 
 
 def daesolve(
@@ -112,12 +113,14 @@ def _run_on_numbers(program: Program, arrays: list[Any], inputs: Any) -> DAESolu
     """
     solve, system, t0, t1, _, y0, args = inputs
     refuse_bad_times(solve.saveat, t0, t1)
-    sol, as_expected = run(program, _ranks.get(program, getattr(system, "rank", None)), arrays)
+    rank = _ranks.get(program, getattr(system, "rank", None))
+    sol, as_expected = run(program, rank, arrays)
     # Inside an outer `jit` the result is no number, although the inputs are: they are looked at each time it is traced.
     if isinstance(as_expected, jax.core.Tracer) or not as_expected:
         with jax.ensure_compile_time_eval():
-            _ranks[program] = refuse_bad_start(system, t0, y0, args)
-        sol, _ = run(program, _ranks[program], arrays)
+            _ranks[program] = refuse_bad_start(system, t0, y0, args, solve.formulation.inverts_mass)
+        if _ranks[program] != rank:
+            sol, _ = run(program, _ranks[program], arrays)
     return sol
 
 

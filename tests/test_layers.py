@@ -19,6 +19,7 @@ LAYERS = (
         "offsets",
         "pencil",
         "reduced",
+        "regularity",
         "residual",
         "systems",
         "taylor",

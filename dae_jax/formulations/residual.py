@@ -1,6 +1,6 @@
 """The equations as they are written, 0 = F(t, y, ẏ), for solvers that take them so."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -26,12 +26,18 @@ class Residual(AbstractFormulation):
       index k counts with h^(k−1) in step-size control. By default found by structural analysis.
     """
 
+    inverts_mass: ClassVar[bool] = False
+
     form: Form = eqx.field(static=True, default="GGL")
     variable_index: tuple[int, ...] | None = eqx.field(static=True, default=None)
 
     def __check_init__(self) -> None:
         if self.form not in ("index-3", "index-2", "GGL"):
             raise ValueError(f'`form` must be "index-3", "index-2" or "GGL", but is {self.form!r}.')
+
+    @property
+    def keeps(self) -> tuple[bool, bool]:
+        return self.form != "index-2", self.form != "index-3"
 
     def encode(self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None) -> tuple[Any, Pencil]:
         form = ResidualForm.of(system, t, state, args, self.form)

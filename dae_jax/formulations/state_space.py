@@ -3,7 +3,7 @@
 import functools
 import inspect
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -33,8 +33,14 @@ class StateSpace(AbstractFormulation):
     Errors: a chart of the wrong dimension or one that does not reach the initial state is refused.
     """
 
+    inverts_mass: ClassVar[bool] = False
+
     chart: Callable[..., Any]
     guess: Any = None
+
+    @property
+    def keeps(self) -> tuple[bool, bool]:
+        return True, True
 
     def encode(
         self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None
@@ -45,7 +51,7 @@ class StateSpace(AbstractFormulation):
                 "StateSpace needs a system whose constraints are all holonomic: no coordinates satisfy a nonholonomic "
                 "constraint by construction. Use OrthogonalProjection or TangentSpace."
             )
-        constraints = mechanical.holonomic if mechanical.rank is None else mechanical.rank
+        constraints = mechanical.holonomic if mechanical.rank is None else mechanical.rank[0]
         ode = ChartODE(mechanical, self.chart, _takes_time(self.chart), mechanical.layout.size - constraints)
         return ode.encode(t, mechanical.encode(state), self.guess), ode
 
