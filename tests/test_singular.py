@@ -8,7 +8,6 @@ import pytest
 
 import dae_jax
 from dae_jax import RESULTS, ConstrainedSystem
-from dae_jax.scenes import SCENES
 
 
 GRAVITY = jnp.array([0.0, -9.81])

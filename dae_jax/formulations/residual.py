@@ -5,10 +5,8 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..constraints import MechanicalODE
 from ..pencil import Pencil
 from ..residual import Form, ResidualForm
-from ..systems import ConstrainedSystem
 from .differentiation import AbstractFormulation
 
 
@@ -41,22 +39,18 @@ class Residual(AbstractFormulation):
 
     def encode(self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None) -> tuple[Any, Pencil]:
         form = ResidualForm.of(system, t, state, args, self.form)
-        y = form.encode(state)
         if self.variable_index is not None and len(self.variable_index) != form.size:
             raise ValueError(
                 f"`variable_index` must have a number for each of {', '.join(form.variables)}: {form.size} in all, but has "
                 f"{len(self.variable_index)}."
             )
-        if isinstance(system, ConstrainedSystem):
-            if rank is not None:
-                raise ValueError(
-                    "Some constraints are redundant, which leaves their multipliers undetermined: a residual needs "
-                    "independent ones. Remove the redundant constraints, or use a solver of the underlying ODE such as "
-                    "OrthogonalProjection."
-                )
-            ode = MechanicalODE.of(system, t, state, args)
-            multipliers = ode.multipliers(t, ode.encode(state))
-            y = jnp.concatenate([y[: form.layout.size], multipliers, jnp.zeros(form.extra - multipliers.size, y.dtype)])
+        if rank is not None:
+            raise ValueError(
+                "Some constraints are redundant, which leaves their multipliers undetermined: a residual needs "
+                "independent ones. Remove the redundant constraints, or use a solver of the underlying ODE such as "
+                "OrthogonalProjection."
+            )
+        form, y = form.at_start(t, state)
         pencil = Pencil.of(form, y, self.variable_index)
         beyond = [name for name, k in zip(form.variables, pencil.outline.indices, strict=True) if k > HIGHEST]
         if beyond:
