@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from .constraints import MechanicalODE
-from .initialise import redundancy, unsolved, violation
-from .normals import SparseNormals
+from .initialise import unsolved, violation
+from .normals import Rank
+from .regularity import mass_is_regular, mass_message, rank_message, rank_of, redundancy
 from .states import NUMBERS, brief, refuse_wrong_state
 from .systems import ConstrainedSystem, ImplicitDAE
 from .user_functions import not_finite, time_axis_advice
@@ -77,26 +78,24 @@ def refuse_bad_times(saveat: Any, t0: Any, t1: Any) -> None:
                 raise ValueError("`saveat.ts` must be in the order in which the solve passes them.")
 
 
-def refuse_bad_start(system: Any, t0: Any, y0: Any, args: Any) -> int | None:
-    """Refuses an inconsistent start in words; the rank of the constraints if some are redundant."""
+def refuse_bad_start(system: Any, t0: Any, y0: Any, args: Any, invertible: bool) -> Rank | None:
+    """Refuses an inconsistent or singular start in words; the rank of the constraints if some are redundant. `invertible`:
+    whether the mass matrix must be.
+    """
     if not isinstance(system, ConstrainedSystem):
         left = _look_at_residual(system, t0, y0, args)
         if not bool(left.consistent()):
             raise ValueError(left.message() + _advice(system, t0, y0, args))
         return None
-    found, redundant = _look(system, t0, y0, args)
+    ode, mass, regular, found, redundant = _look(system, t0, y0, args, invertible)
+    if not bool(regular):
+        raise ValueError(mass_message(np.asarray(mass), invertible))
     if not bool(found.consistent()):
         raise ValueError(found.message() + _advice(system, t0, y0, args))
-    count = found.residuals[1].shape[0]
-    if system.rank is not None or redundant is None:
-        return system.rank
-    rank = int(redundant.rank)
-    if rank < count and float(redundant.contradiction) > 1e-6:
-        raise ValueError(
-            f"Only {rank} of the {count} constraints are independent at the start, and the others contradict them: no "
-            "acceleration satisfies all. Remove the redundant constraints or make them agree."
-        )
-    return rank if rank < count else None
+    message = rank_message(ode, redundant, system.rank)
+    if message:
+        raise ValueError(message)
+    return rank_of(ode, redundant)
 
 
 def _advice(system: Any, t0: Any, y0: Any, args: Any) -> str:
@@ -106,10 +105,11 @@ def _advice(system: Any, t0: Any, y0: Any, args: Any) -> str:
 
 
 @eqx.filter_jit
-def _look(system: Any, t: Any, y0: Any, args: Any) -> Any:
+def _look(system: Any, t: Any, y0: Any, args: Any, invertible: bool) -> Any:
     ode = MechanicalODE.of(system, t, y0, args)
     y = ode.encode(y0)
-    return violation(ode, t, y), None if isinstance(ode.linear, SparseNormals) else redundancy(ode, t, y)
+    mass, regular = ode.unchecked_mass(y[0]), mass_is_regular(ode, y[0], invertible)
+    return ode, mass, regular, violation(ode, t, y), redundancy(ode, t, y)
 
 
 @eqx.filter_jit

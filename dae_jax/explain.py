@@ -166,7 +166,8 @@ def explain(
     inputs = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray | np.generic) else x, inputs)
     solve, system, t0, _, _, y0, args = inputs
     traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(inputs))
-    rank = system.rank if traced else refuse_bad_start(system, t0, y0, args)
+    invertible = solve.formulation.inverts_mass
+    rank = getattr(system, "rank", None) if traced else refuse_bad_start(system, t0, y0, args, invertible)
     kernel, arrays = solve.kernel(*inputs[1:], rank)
     found = hindrances(jax.make_jaxpr(without_checks(kernel))(arrays))
     enabled = one_kernel_enabled() and jax.default_backend() == "cpu" and solve.derivative() != "any"

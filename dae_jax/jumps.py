@@ -23,6 +23,10 @@ from .underlying import underlying_ode
 from .user_functions import refuse_other_arguments, returned
 
 
+# Entries of `stats` that do not add up over the parts of a solve.
+NO_COUNTS = ("max_steps", "end_time")
+
+
 class Jump(eqx.Module):
     """An `event` after which the solve goes on: a stop that is hit, a diode that switches.
 
@@ -159,13 +163,13 @@ def solve_with_jumps(
         return one(system, p.t, t1, dt0, p.y, p.args, rank)
 
     def advance(p: _Progress) -> _Progress:
-        sol, consistent = part(p)
+        sol, _ = part(p)
         end, reached = sol.ts["end"][-1], jax.tree.map(lambda y: y[-1], sol.ys["end"])
         here = (sign * wanted >= sign * p.t) & (sign * wanted <= sign * end)
         ts = jnp.where(here, wanted, p.ts)
         ys = jax.tree.map(lambda a, b: jnp.where(here.reshape(-1, *(1,) * (a.ndim - 1)), a, b), sol.ys["wanted"], p.ys)
-        stats = {k: p.stats[k] + v for k, v in sol.stats.items() if k != "max_steps"}
-        code = jnp.where(consistent, sol.result._value, RESULTS.inconsistent_start._value)
+        stats = {k: p.stats[k] + v for k, v in sol.stats.items() if k not in NO_COUNTS}
+        code = sol.result._value
         # Jumps so close that their order is round-off are no events any more.
         piled = (p.count > 0) & (sign * (end - p.t) <= 16 * resolution * (1 + jnp.abs(end)))
         jumps, exhausted = code == going, piled | (p.count >= jump.most)
@@ -180,7 +184,7 @@ def solve_with_jumps(
 
     shape = jax.eval_shape(part, _Progress(t0, y0, args, *[None] * 6))[0]
     unsaved = jax.tree.map(lambda x: jnp.full(x.shape, jnp.inf, x.dtype), shape.ys["wanted"])
-    stats = {k: jnp.zeros((), int) for k in shape.stats if k != "max_steps"}
+    stats = {k: jnp.zeros((), int) for k in shape.stats if k not in NO_COUNTS}
     start = _Progress(
         t0, y0, args, jnp.zeros((), int), jnp.full(jump.most, jnp.inf, t0.dtype),
         jnp.full_like(wanted, jnp.inf), unsaved, stats, jnp.asarray(going, RESULTS.successful._value.dtype),
@@ -188,10 +192,11 @@ def solve_with_jumps(
     kind: Any = "checkpointed" if solve.derivative() == "reverse" else "lax"
     most = {"max_steps": jump.most + 1} if kind == "checkpointed" else {}
     p = eqxi.while_loop(lambda p: p.code == going, advance, start, kind=kind, **most)
-    stats = {"max_steps": solve.max_steps, **p.stats, "jumps": p.count, "jump_times": p.times}
+    stats = {"max_steps": solve.max_steps, **p.stats, "end_time": p.t, "jumps": p.count, "jump_times": p.times}
     result = eqx.tree_at(lambda r: r._value, RESULTS.successful, p.code)
     sol = DAESolution(t0, t1, p.ts, p.ys, None, stats, result, None, args, rank)
-    return sol, p.code != RESULTS.inconsistent_start._value
+    refused = (RESULTS.inconsistent_start, RESULTS.dependent_constraints, RESULTS.irregular_mass)
+    return sol, ~jnp.any(jnp.stack([p.code == code._value for code in refused]))
 
 
 def _after(system: System, jump: Jump, t: Any, y: Any, args: Any) -> tuple[Any, Any]:

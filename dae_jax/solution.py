@@ -17,10 +17,24 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "The initial state `y0` violates the constraints (position or velocity level). "
         "`dae_jax.consistent_state(system, t0, y0, args)` gives the nearest state that does not."
     )
+    dependent_constraints = (
+        "The constraints depend on each other at the start, or not as many are independent as `rank` says: a gradient "
+        "vanishes (write the constraint itself, not its square), the start is a singular configuration, or constraints are "
+        "redundant. Where these agree say how many are independent by `ConstrainedSystem(..., rank=...)`: with a start that "
+        "is traced (`jit`, `vmap`) it is not found."
+    )
+    irregular_mass = (
+        "The mass matrix is not symmetric and positive definite, at the start or where the solve ended. A massless "
+        "coordinate is for RadauIIA5() or BDF() with GGL() or Residual(...), and for DummyDerivatives()."
+    )
+    off_constraints = (
+        "The solution does not satisfy the constraints at its end: it has drifted off by as much as its own size, "
+        "constraints that were redundant contradict each other, or one has become singular. Use a method that keeps the "
+        "constraints, such as OrthogonalProjection, and smaller steps or tolerances; `dae_jax.drift` shows where."
+    )
     not_finite = (
-        "The solution is not finite: the force or a constraint returned NaN or infinity, the constraints became "
-        "dependent (say how many are independent by `ConstrainedSystem(..., rank=...)`), or the steps are too large for "
-        "the method."
+        "The solution is not finite: the force, the mass matrix or a constraint returned NaN or infinity, a mass became "
+        "negative, the constraints became dependent, or the steps are too large for the method."
     )
     step_rejected = (
         "The step size went to the resolution of time: at the last time reached the force is not finite, the "

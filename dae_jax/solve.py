@@ -8,16 +8,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from .checks import as_array, checked, refuse_bad_start, refuse_bad_times
+from .failures import OKAY, in_words, raised_in_the_program
 from .formulations import AbstractFormulation, Differentiation, DummyDerivatives, ReducedResidual, Residual
 from .jumps import Jump, refuse_other_outputs
+from .normals import Rank
 from .options import refuse_misfits, refuse_no_event, refuse_other_steps, refuse_wrong_options, takes_residuals
 from .program import Program, Solve, run, split
-from .solution import RESULTS, DAESolution
+from .solution import DAESolution
 from .solvers import SelectedResiduals, SelectedStates
 from .systems import System
+from .user_functions import not_finite
 
 
-_ranks: dict[Program, int | None] = {}
+_ranks: dict[Program, Rank | None] = {}
 
 
 def daesolve(
@@ -70,7 +73,7 @@ def daesolve(
         sol, _ = run(program, getattr(system, "rank", None), arrays)
     else:
         sol = _run_on_numbers(program, arrays, inputs)
-    return _raise_if_failed(sol) if throw else sol
+    return _raise_if_failed(sol, inputs) if throw else sol
 
 
 def prepared(
@@ -107,12 +110,14 @@ def _run_on_numbers(program: Program, arrays: list[Any], inputs: Any) -> DAESolu
     """
     solve, system, t0, t1, _, y0, args = inputs
     refuse_bad_times(solve.saveat, t0, t1)
-    sol, as_expected = run(program, _ranks.get(program, getattr(system, "rank", None)), arrays)
+    rank = _ranks.get(program, getattr(system, "rank", None))
+    sol, as_expected = run(program, rank, arrays)
     # Inside an outer `jit` the result is no number, although the inputs are: they are looked at each time it is traced.
     if isinstance(as_expected, jax.core.Tracer) or not as_expected:
         with jax.ensure_compile_time_eval():
-            _ranks[program] = refuse_bad_start(system, t0, y0, args)
-        sol, _ = run(program, _ranks[program], arrays)
+            _ranks[program] = refuse_bad_start(system, t0, y0, args, solve.formulation.inverts_mass)
+        if _ranks[program] != rank:
+            sol, _ = run(program, _ranks[program], arrays)
     return sol
 
 
@@ -125,16 +130,10 @@ def _default_controller(dt0: Any, dtype: Any) -> Any:
 _PID64, _PID32 = (diffrax.PIDController(rtol=tolerance, atol=tolerance) for tolerance in (1e-8, 1e-5))
 
 
-_OKAY = {int(code._value) for code in (RESULTS.successful, RESULTS.event_occurred)}
-
-
-def _raise_if_failed(sol: DAESolution) -> DAESolution:
+def _raise_if_failed(sol: DAESolution, inputs: Any) -> DAESolution:
     if isinstance(sol.result._value, jax.core.Tracer):
-        okay = (sol.result == RESULTS.successful) | (sol.result == RESULTS.event_occurred)
-        return sol.result.error_if(sol, ~okay)
-    if int(sol.result._value) in _OKAY:
+        return raised_in_the_program(sol)
+    if int(sol.result._value) in OKAY:
         return sol
-    reached = [np.asarray(t)[np.isfinite(t)] for t in jax.tree.leaves(sol.ts)]
-    last = [t[-1] for t in reached if t.size]
-    where = f" (last saved time: t = {last[-1]:.6g})" if last else ""
-    raise RuntimeError(f"{RESULTS[sol.result]}{where} {sol.stats['num_steps']} steps were taken.")
+    _, system, t0, _, _, y0, args = inputs
+    raise RuntimeError(" ".join([str(in_words(sol)), not_finite(system, t0, y0, args)]).strip())

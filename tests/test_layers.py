@@ -19,6 +19,7 @@ LAYERS = (
         "offsets",
         "pencil",
         "reduced",
+        "regularity",
         "residual",
         "states",
         "systems",
@@ -27,7 +28,7 @@ LAYERS = (
         "user_functions",
     },
     {"formulations", "solvers"},
-    {"analyse", "checks", "diagnostics", "explain", "jumps", "options", "program", "solution", "solve", "tape"},
+    {"analyse", "checks", "diagnostics", "explain", "failures", "jumps", "options", "program", "solution", "solve", "tape"},
     {"baumgarte_loss", "compare", "maps", "plotting", "reductions", "scenes", "sweep", "sweep_store", "tune"},
     {"__main__", "cli"},
 )
