@@ -65,6 +65,10 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
 
 
+# A success says so where it is printed.
+RESULTS._index_to_message[int(RESULTS.successful._value)] = "successful"
+
+
 class Interpolation(eqx.Module):
     """The solution at any time, in the user's structure, on the manifold where the method keeps its steps there."""
 
@@ -102,11 +106,37 @@ class DAESolution(eqx.Module):
     args: Any = None
     rank: int | None = eqx.field(static=True, default=None)
 
+    @property
+    def final(self) -> Any:
+        """The last saved state, to go on from with `y0=sol.final`; of each part of `SaveAt(subs=...)` where there are any.
+        Infinite where nothing was saved. Of a batch of solutions, the last state of each.
+
+        Errors: `ValueError` where the solve was to save nothing.
+        """
+        if self.ts is None:
+            raise ValueError("The solution has no saved states; pass `saveat=diffrax.SaveAt(t1=True)`.")
+        return jax.tree.map(_last, self.ts, self.ys)
+
     def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Any:
         """The state at any time, where `SaveAt(dense=True)` was asked for."""
         if self.interpolation is None:
             raise ValueError("The solution has no dense output; pass `saveat=diffrax.SaveAt(dense=True)`.")
         return self.interpolation.evaluate(t0, t1, left)
+
+
+def _last(ts: Any, ys: Any) -> Any:
+    if ts.ndim > 1:
+        return jax.vmap(_last)(ts, ys)
+    return jax.tree.map(lambda y: y[-1], without_padding(ts, ys)[1])
+
+
+def without_padding(ts: Any, ys: Any) -> tuple[Any, Any]:
+    """Saved times and states with padding, times that are infinite, overwritten by the last ones that were saved: every
+    function of them then has its value there, and its largest and smallest are those over the saved times.
+    """
+    last = jnp.maximum(jnp.sum(jnp.isfinite(ts)) - 1, 0)
+    at = jnp.minimum(jnp.arange(ts.shape[0]), last)
+    return ts[at], jax.tree.map(lambda y: y[at], ys)
 
 
 def all_finite(ts: Any, ys: Any) -> Any:

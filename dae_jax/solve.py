@@ -12,9 +12,9 @@ from .failures import OKAY, in_words, raised_in_the_program
 from .formulations import AbstractFormulation, Differentiation, DummyDerivatives, ReducedResidual, Residual
 from .jumps import Jump, refuse_other_outputs
 from .normals import Rank
-from .options import refuse_misfits, refuse_no_event, refuse_other_steps, refuse_wrong_options, takes_residuals
 from .program import Program, Solve, run, split
 from .solution import DAESolution
+from .solve_options import refuse_misfits, refuse_no_event, refuse_other_steps, refuse_wrong_options, takes_residuals
 from .solvers import SelectedResiduals, SelectedStates
 from .systems import System
 from .user_functions import not_finite

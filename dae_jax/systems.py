@@ -56,9 +56,7 @@ class ConstrainedSystem(eqx.Module):
                 "without either it is an ODE, which `diffrax.diffeqsolve` solves."
             )
         counts = self.rank if isinstance(self.rank, tuple) else (self.rank,)
-        if self.rank is not None and not (
-            len(counts) in (1, 2) and all(type(k) is int for k in counts) and counts[-1] > 0
-        ):
+        if self.rank is not None and not (len(counts) < 3 and all(type(k) is int and k >= 0 for k in counts)):
             raise ValueError(
                 "`rank` must be how many of the constraints are independent, an integer (or a pair, of the holonomic ones and "
                 f"of all), or None for all of them, but is {self.rank!r}."

@@ -123,6 +123,12 @@ def refuse_no_numbers(found: Any, call: str) -> None:
             )
 
 
+def refuse_no_real_number(found: Any, call: str) -> None:
+    """Refuses results that are not one real number."""
+    if not isinstance(found, NUMBERS) or jnp.shape(found) != () or np.dtype(jnp.result_type(found)).kind not in "fiu":
+        raise ValueError(f"`{call}` must return a real number, but returns {describe(found)}.")
+
+
 def _shapes(tree: Any) -> tuple[Any, list[Any]]:
     leaves, structure = jax.tree.flatten(tree)
     return structure, [jnp.shape(x) for x in leaves]
