@@ -134,7 +134,7 @@ def _at_saved_times(system: System, sol: DAESolution, of: Callable[..., Any]) ->
 def _refuse_no_states(system: System, ts: Any, ys: Any, args: Any) -> None:
     one = jax.tree.map(lambda y: jax.ShapeDtypeStruct(y.shape[1:], y.dtype), ys)
     try:
-        refuse_wrong_state(system, one)
+        refuse_wrong_state(system, one, "sol.ys")
         refuse_wrong_functions(system, ts[0], one, args)
     except (TypeError, ValueError) as refusal:
         raise ValueError(

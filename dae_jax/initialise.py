@@ -14,8 +14,10 @@ from .normals import Rank, mass_solve
 from .pencil import Pencil
 from .regularity import has_rank, is_near_constraints, mass_is_regular
 from .residual import ResidualForm
+from .states import broadcast_to_state, refuse_wrong_state
 from .systems import ConstrainedSystem, System
 from .underlying import StructuralODE
+from .user_functions import refuse_wrong_functions
 
 
 # What part of the interval a solve that failed is looked on beyond its end; and the second and third power of it.
@@ -158,12 +160,15 @@ def consistent_state(
     Errors: `ValueError` where no such state is found from here, naming the equations that remain off; NaN where the
     arguments are traced.
     """
+    refuse_wrong_state(system, y0)
     y0 = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
+    refuse_wrong_functions(system, t0, y0, args)
     masks = jax.tree.map(lambda x: jnp.zeros_like(x, dtype=bool), y0)
     if fixed is not None:
-        masks = jax.tree.map(lambda f, x: jnp.broadcast_to(jnp.asarray(f, bool), jnp.shape(x)), fixed, y0)
+        masks = jax.tree.map(lambda f: f.astype(bool), broadcast_to_state("fixed", fixed, y0, "booleans"))
     if rates is not None:
-        rates = jax.tree.map(lambda r, x: jnp.broadcast_to(jnp.asarray(r, x.dtype), x.shape), rates, y0)
+        rates = broadcast_to_state("rates", rates, y0, "numbers")
+        rates = jax.tree.map(lambda r, x: r.astype(x.dtype), rates, y0)
     if isinstance(system, ConstrainedSystem) and rates is None:
         found, fine, remains = _nearest_of_mechanism(system, t0, y0, args, masks)
     else:

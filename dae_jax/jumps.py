@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from .checks import saved_parts
 from .initialise import consistent_state
-from .solution import RESULTS, DAESolution
+from .solution import RESULTS, DAESolution, precision_of
 from .states import NUMBERS, brief, broadcast_to_state, describe
 from .systems import System
 from .underlying import underlying_ode
@@ -194,7 +194,8 @@ def solve_with_jumps(
     p = eqxi.while_loop(lambda p: p.code == going, advance, start, kind=kind, **most)
     stats = {"max_steps": solve.max_steps, **p.stats, "end_time": p.t, "jumps": p.count, "jump_times": p.times}
     result = eqx.tree_at(lambda r: r._value, RESULTS.successful, p.code)
-    sol = DAESolution(t0, t1, p.ts, p.ys, None, stats, result, None, args, rank)
+    precision = precision_of(t0.dtype, solve.controller)
+    sol = DAESolution(t0, t1, p.ts, p.ys, None, stats, result, None, args, rank, precision)
     refused = (RESULTS.inconsistent_start, RESULTS.dependent_constraints, RESULTS.irregular_mass)
     return sol, ~jnp.any(jnp.stack([p.code == code._value for code in refused]))
 

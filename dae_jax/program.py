@@ -20,7 +20,7 @@ from .kernels import PullBack, inexact, one_kernel, one_kernel_enabled
 from .linalg import rms_norm
 from .normals import Rank
 from .regularity import COARSE
-from .solution import RESULTS, DAESolution, Interpolation, all_finite
+from .solution import RESULTS, DAESolution, Interpolation, all_finite, precision_of
 from .solvers import (
     DOP853,
     AbstractManifoldSolver,
@@ -285,14 +285,16 @@ class Solve(eqx.Module):
         ts, ys = cast(Any, sol.ts), cast(Any, sol.ys)
         end = jax.lax.stop_gradient(jax.tree.map(lambda x: x[-1], (ts["end"], ys["end"])))
         stats = {**sol.stats, "end_time": end[0]}
+        starts = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(y)]))
+        result = RESULTS.where(starts, RESULTS.promote(sol.result), RESULTS.no_finite_start)
         if selects:
             stats["switches"] = cast(Any, sol.solver_state).switches
-        return sol.t0, sol.t1, ts["user"], ys["user"], interpolation, stats, sol.result, sol.event_mask, end
+        return sol.t0, sol.t1, ts["user"], ys["user"], interpolation, stats, result, sol.event_mask, end
 
     def _solution(self, out: Any, args: Any, rank: int | Rank | None, found: Any) -> DAESolution:
         *fields, result, event_mask = out
         (start, _), (near, masses, masses_ahead) = found
-        code = RESULTS.promote(result)
+        code = result
         _, _, ts, ys, *_ = fields
         failed = lambda name, instead, when=True: RESULTS.where((code == name) & when, instead, code)
         if isinstance(self.formulation, Residual):
@@ -304,12 +306,13 @@ class Solve(eqx.Module):
         if ts is not None:
             finite = [all_finite(*pair) for pair in _saved(self.saveat, ts, ys)]
             code = failed(RESULTS.successful, RESULTS.not_finite, ~jnp.all(jnp.stack(finite))) if finite else code
+        precision = precision_of(fields[0].dtype, self.controller)
         went_well = (code == RESULTS.successful) | (code == RESULTS.event_occurred)
         code = RESULTS.where(went_well & ~near, RESULTS.off_constraints, code)
         code = RESULTS.where(masses & (masses_ahead | went_well), code, RESULTS.irregular_mass)
         for wrong, name in enumerate(("inconsistent_start", "dependent_constraints", "irregular_mass"), 1):
             code = RESULTS.where(start == wrong, getattr(RESULTS, name), code)
-        return DAESolution(*fields, code, event_mask, args, rank[1] if isinstance(rank, tuple) else rank)
+        return DAESolution(*fields, code, event_mask, args, rank[1] if isinstance(rank, tuple) else rank, precision)
 
 
 def _saved(saveat: Any, ts: Any, ys: Any) -> list[tuple[Any, Any]]:

@@ -65,7 +65,7 @@ class ResidualForm(eqx.Module):
             equations = _names("residual", out)
         if len(equations) != layout.size:
             raise ValueError(
-                f"A {type(system).__name__} must have as many equations as unknowns, but has {len(equations)} equations "
+                f"{type(system).__name__} must have as many equations as unknowns, but has {len(equations)} equations "
                 f"for {layout.size} unknowns."
             )
         return cls(system, args, form, layout, 0, equations)

@@ -7,6 +7,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Real
 
 
@@ -31,6 +32,10 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "The solution does not satisfy the constraints at its end: it has drifted off by as much as its own size, "
         "constraints that were redundant contradict each other, or one has become singular. Use a method that keeps the "
         "constraints, such as OrthogonalProjection, and smaller steps or tolerances; `dae_jax.drift` shows where."
+    )
+    no_finite_start = (
+        "The formulation has no finite starting point: the chart of `StateSpace` does not give the initial positions (it must "
+        "satisfy the constraints for every z; near a fold give `guess`), or a function is not finite at the start."
     )
     not_finite = (
         "The solution is not finite: the force, the mass matrix or a constraint returned NaN or infinity, a mass became "
@@ -89,10 +94,11 @@ class DAESolution(eqx.Module):
     - `t0`, `t1`: the interval.
     - `ts`: the saved times; `ys`: the saved states, with the structure of `y0` (or of what `SaveAt(fn=...)` returns).
     - `interpolation`: with `SaveAt(dense=True)`, the solution at any time; `sol.evaluate(t)` for short.
-    - `stats`: counts of steps.
+    - `stats`: counts of steps; `stats["end_time"]`: the time at which the solve ended.
     - `result`: a `RESULTS` code, with its message.
     - `event_mask`: which event ended the solve, if any.
     - `rank`: how many constraints are independent, where some are redundant, else `None`.
+    - `precision`: with how many digits it was computed, and the tolerances: "float32, rtol 1e-05, atol 1e-05".
     """
 
     t0: Any
@@ -105,6 +111,7 @@ class DAESolution(eqx.Module):
     event_mask: Any
     args: Any = None
     rank: int | None = eqx.field(static=True, default=None)
+    precision: str = eqx.field(static=True, default="")
 
     @property
     def final(self) -> Any:
@@ -122,6 +129,15 @@ class DAESolution(eqx.Module):
         if self.interpolation is None:
             raise ValueError("The solution has no dense output; pass `saveat=diffrax.SaveAt(dense=True)`.")
         return self.interpolation.evaluate(t0, t1, left)
+
+
+def precision_of(dtype: Any, controller: Any) -> str:
+    """With how many digits a solve computes and what it allows for an error, in words."""
+    if not isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
+        return f"{np.dtype(dtype)}, fixed steps"
+    given = {name: getattr(controller, name, None) for name in ("rtol", "atol")}
+    said = [f"{name} {value:g}" for name, value in given.items() if isinstance(value, float | int)]
+    return ", ".join([str(np.dtype(dtype)), *said])
 
 
 def _last(ts: Any, ys: Any) -> Any:

@@ -20,8 +20,15 @@ def brief(x: Any) -> str:
         return f"the class {x.__name__}: write {x.__name__}(...)"
     if inspect.isfunction(x):
         return f"the function {x.__name__}"
+    if any(isinstance(leaf, jax.ShapeDtypeStruct) for leaf in jax.tree.leaves(x)):
+        return describe(x)
     text = repr(x)
     return text if len(text) < 200 else text[:200] + "…"
+
+
+def counted(number: int, noun: str, plural: str = "") -> str:
+    """`number` things: "1 constraint", "2 constraints", "1 degree", "2 degrees of freedom"."""
+    return f"{number} {noun if number == 1 else plural or noun + 's'}"
 
 
 def describe(tree: Any) -> str:
@@ -92,9 +99,11 @@ def broadcast_to_state(name: str, tree: Any, state: Any, what: str) -> Any:
 
     Errors: `ValueError` where that cannot be.
     """
-    try:
-        return jax.tree.map(lambda x, y: jnp.broadcast_to(jnp.asarray(x), jnp.shape(y)), tree, state)
-    except (TypeError, ValueError):
-        raise ValueError(
-            f"`{name}` must hold {what} in the structure of the state, {describe(state)}, but is {describe(tree)}."
-        ) from None
+    if jax.tree.structure(tree) == jax.tree.structure(state):
+        try:
+            return jax.tree.map(lambda x, y: jnp.broadcast_to(jnp.asarray(x), jnp.shape(y)), tree, state)
+        except (TypeError, ValueError):
+            pass
+    raise ValueError(
+        f"`{name}` must hold {what} in the structure of the state, {describe(state)}, but is {describe(tree)}."
+    )

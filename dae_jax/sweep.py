@@ -20,6 +20,7 @@ from jaxtyping import PyTree
 from .failures import sentence_of
 from .progress import Progress
 from .solution import RESULTS
+from .states import brief
 from .sweep_store import Memory, Store
 
 
@@ -94,6 +95,8 @@ def sweep(
     Errors: `ValueError` for inputs without a common leading axis, and for a store of another sweep; `OSError` before the
     work starts where the store cannot be written or there is no room for it.
     """
+    if not callable(fn):
+        raise TypeError(f"`fn` must be a function of one element, but is {brief(fn)}.")
     elements = inputs.elements() if isinstance(inputs, Grid) else jax.tree.map(np.asarray, inputs)
     size = _leading(elements)
     devices = list(devices or jax.local_devices())

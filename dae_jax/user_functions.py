@@ -146,7 +146,7 @@ def _like(found: Any, call: str, like: Any, name: str) -> None:
             raise ValueError(
                 f"`{call}` must return real numbers in the structure of {name}, but returns {describe(found)}."
             )
-    is_vector = len(jax.tree.leaves(like)) == 1 and jnp.ndim(jax.tree.leaves(like)[0]) < 2
+    is_vector = isinstance(like, NUMBERS) and jnp.ndim(like) < 2
     if _shapes(found) != _shapes(like) and not (is_vector and _count(found) == _count(like)):
         raise ValueError(
             f"`{call}` must return the structure of {name}, {describe(like)}, but returns {describe(found)}."

@@ -219,7 +219,7 @@ def test_a_system_of_200_equations():
 
 def test_command(capsys):
     assert main(["analyse", "pendulum"]) == 0
-    assert "index 3, 2 degrees of freedom" in capsys.readouterr().out
+    assert "index 3, 1 degree of freedom of the mechanism (2 initial values to choose)" in capsys.readouterr().out
     assert main(["analyse", "dae_jax.scenes:knife_edge"]) == 0
     assert "index 2" in capsys.readouterr().out
     for wrong in ("pendulums", "dae_jax.scenes:nothing", "math:pi"):
