@@ -1,6 +1,7 @@
 """How a solve that failed says so: the sentence, and how it gets out of a compiled program."""
 
 import logging
+import re
 from typing import Any
 
 import equinox as eqx
@@ -47,7 +48,7 @@ def _sentence(code: Any, end: Any, t0: Any, t1: Any, steps: Any) -> str | None:
             " It ran in float32, which resolves 1.2e-07 of a number: for more, switch on float64 by "
             '`jax.config.update("jax_enable_x64", True)` right after the imports.'
         )
-    if np.ndim(code):
+    if np.size(code) > 1:
         said = (
             f"{failed.size} of a batch of {np.size(code)} solves failed, the first of them number {failed[0]}: {said}"
         )
@@ -86,6 +87,6 @@ def _without_ours(record: logging.LogRecord) -> bool:
 
 
 def sentence_of(error: BaseException) -> str | None:
-    """What a `SolveFailed` said that JAX hands on as `error`; `None` for other errors."""
+    """What a `SolveFailed` said that JAX hands on as `error`, without the place in a batch; `None` for other errors."""
     _, found, sentence = str(error).rpartition(f"{SolveFailed.__name__}: ")
-    return sentence.strip() if found else None
+    return re.sub(r"^\d+ of a batch of .*?: ", "", sentence).strip() if found else None

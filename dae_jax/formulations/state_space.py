@@ -42,7 +42,7 @@ class StateSpace(AbstractFormulation):
     def __check_init__(self) -> None:
         if not callable(self.chart):
             raise TypeError(f"`chart` of StateSpace must be a function from coordinates z to q, but is {self.chart!r}.")
-        if self.guess is not None and not isinstance(self.guess, NUMBERS + (list, tuple)):
+        if self.guess is not None and not isinstance(self.guess, (*NUMBERS, list, tuple)):
             raise TypeError(f"`guess` of StateSpace must be a vector of coordinates, but is {self.guess!r}.")
 
     @property
