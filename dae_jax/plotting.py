@@ -104,10 +104,9 @@ def over_time(
     The curve called `exact` is drawn wide and grey behind the others, so that what agrees with it stays visible.
     """
     figure, axes = _figure()
-    curves = {label: _saved(*curve) for label, curve in curves.items()}
     if exact is not None:
-        axes.plot(*curves[exact], color=GREY, alpha=0.6, linewidth=4, label=exact)
-    others = {k: xy for k, xy in curves.items() if k != exact}
+        axes.plot(*_saved(*curves[exact]), color=GREY, alpha=0.6, linewidth=4, label=exact)
+    others = {k: _saved(*xy) for k, xy in curves.items() if k != exact}
     for i, (label, (x, y)) in enumerate(others.items()):
         axes.plot(
             x, y, color=COLOURS[i % len(COLOURS)], linewidth=1.4, linestyle=("-", "--", "-.", ":")[i % 4], label=label
