@@ -15,7 +15,7 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     """diffrax's result codes, and those of a DAE."""
 
     inconsistent_start = (
-        "The initial state `y0` violates the constraints (position or velocity level). "
+        "The initial state `y0` violates the equations or the hidden constraints (of a mechanism: at position or velocity level). "
         "`dae_jax.consistent_state(system, t0, y0, args)` gives the nearest state that does not."
     )
     dependent_constraints = (
