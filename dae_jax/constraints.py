@@ -33,6 +33,11 @@ from .structure.layout import Layout
 from .systems import ConstrainedSystem
 
 
+def allowed_contradiction(dtype: Any) -> float:
+    """The part of the accelerations that dependent constraints ask for in which they may disagree."""
+    return max(1e-6, float(jnp.finfo(dtype).eps) ** 0.5)
+
+
 def at_one_instant(method: Callable[..., Any]) -> Callable[..., Any]:
     """Runs a method of an `eqx.Module` as scalar arithmetic where it is small, traced once for all its call sites."""
 
@@ -228,8 +233,21 @@ class MechanicalODE(ManifoldODE):
         target = self.bias(t, q, v)
         if feedback is not None:
             target = target + self._feedback(t, q, v, feedback)
-        multipliers = self.linear.gram_solve(self, normals, self.linear.along(self, normals, free) + target)
-        return free - self.linear.lift(self, normals, multipliers), multipliers
+        target = self.linear.along(self, normals, free) + target
+        multipliers = self.linear.gram_solve(self, normals, target)
+        pulled = self.linear.lift(self, normals, multipliers)
+        if self.rank is not None:
+            pulled = self._unless_contradictory(t, (q, v), normals, target, pulled)
+        return free - pulled, multipliers
+
+    def _unless_contradictory(self, t: Any, y: Any, normals: Any, target: Any, pulled: Any) -> Any:
+        """x = M⁻¹Aᵀλ, or NaN where it leaves more of A x = b than y is off the constraints: dependent ones disagree."""
+        lengths = self.linear.lengths(normals)
+        lengths = jnp.where(lengths > 0, lengths, 1)
+        off = jnp.max(jnp.abs(self.linear.along(self, normals, pulled) - target) / lengths)
+        drift = jnp.max(jnp.concatenate(self.distances(t, y)))
+        allowed = (allowed_contradiction(drift.dtype) + 10 * drift) * (1 + jnp.max(jnp.abs(target) / lengths))
+        return jnp.where(off <= allowed, pulled, jnp.nan)
 
     def _feedback(self, t: Any, q: Any, v: Any, feedback: Any) -> Float[Array, " mp"]:
         velocity = self.velocity_constraint(t, q, v)

@@ -210,14 +210,14 @@ def explain(
     return MechanicalPlan(
         method=method,
         precision=precision,
-        linear_solver=_linear_solver(ode, count, rank),
+        linear_solver=_linear_solver(ode, count),
         operations=_operations(lambda y: ode.field(t0, y), y),
         one_kernel=enabled and not found,
         hindrances=found,
         left_out=tuple(_left_out(ode, solve)),
         coordinates=ode.layout.size,
         constraints=count,
-        independent=None if traced else rank or count,
+        independent=None if traced else rank[1] if rank else count,
         mass=_mass(system, ode.mass(y[0])),
         constraints_depend_on_time=any(ode.depends_on_time),
         nonzeros=None if sparse is None else int((sparse.columns >= 0).sum()),
@@ -255,14 +255,14 @@ def _mass(system: Any, mass: Any) -> str:
     return kind + (" that depend on q" if callable(system.mass) else "")
 
 
-def _linear_solver(ode: MechanicalODE, count: int, rank: int | None) -> str:
+def _linear_solver(ode: MechanicalODE, count: int) -> str:
     if isinstance(ode.linear, SparseNormals):
         gram = ode.linear.gram
         return f"sparse elimination in {counted(len(gram.levels), 'level')}, {counted(gram.cost, 'multiplication')}" + (
             f", then a dense system of {gram.rest_size}" if gram.rest_size > 1 else ""
         )
-    if rank is not None:
-        return f"least norm by eigenvalues, rank {rank} of {count} (LAPACK)"
+    if ode.rank is not None:
+        return f"least norm by eigenvalues, rank {ode.rank[1]} of {count} (LAPACK)"
     kind = "straight-line" if count <= UNROLLED else "a loop over columns" if count <= LOOPED else "Cholesky (LAPACK)"
     return f"dense elimination of {counted(count, 'unknown')}, {kind}"
 

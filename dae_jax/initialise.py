@@ -12,7 +12,7 @@ from .constraints import MechanicalODE
 from .linalg import fixed_point, implicit_root, relative_change
 from .normals import Rank, mass_solve
 from .pencil import Pencil
-from .regularity import has_rank, is_near_constraints, mass_is_regular
+from .regularity import has_rank, is_near_constraints, mass_is_regular, weakest
 from .residual import ResidualForm
 from .states import broadcast_to_state, refuse_wrong_state
 from .systems import ConstrainedSystem, System
@@ -22,6 +22,8 @@ from .user_functions import refuse_wrong_functions
 
 # What part of the interval a solve that failed is looked on beyond its end; and the second and third power of it.
 AHEAD = 1e-3
+# A smallest pivot below this power of round-off is that of constraints that become dependent.
+SINGULAR = 3 / 8
 
 
 class Violation(eqx.Module):
@@ -120,25 +122,36 @@ def look_at_start(
     return wrong, (wrong == 0) & surely
 
 
+class End(eqx.Module):
+    """What a mechanism's state at the end of a solve says: whether it satisfies the constraints (see `is_near_constraints`)
+    and these nearly depend on each other; whether the masses are regular there, and also beyond, where a solve that failed
+    did not get.
+    """
+
+    near: Bool[Array, ""]
+    singular: Bool[Array, ""]
+    masses: Bool[Array, ""]
+    masses_ahead: Bool[Array, ""]
+
+
 def look_at_end(
     system: System, t0: Any, start: Any, args: Any, rank: int | Rank | None, invertible: bool, end: Any, keeps: Any,
     tolerances: Any, residual: bool,
-) -> tuple[Bool[Array, ""], Bool[Array, ""], Bool[Array, ""]]:  # fmt: skip
-    """Whether the state at the end satisfies the constraints (see `is_near_constraints`), whether the masses are regular
-    there, and whether also beyond it, where a solve that failed did not get.
-    """
+) -> End:  # fmt: skip
+    """The state (t, y) at the `end` of a solve."""
     yes = jnp.asarray(True)
     if not isinstance(system, ConstrainedSystem):
-        return yes, yes, yes
+        return End(yes, ~yes, yes, yes)
     ode = MechanicalODE.of(system, t0, start, args, rank)
     start, (t, end) = ode.encode(start), (end[0], ode.encode(end[1]))
     near = is_near_constraints(ode, t, start, end, keeps, tolerances, residual)
+    singular = ~yes if ode.rank else weakest(ode, t, end) < jnp.finfo(t.dtype).eps ** SINGULAR
     if not callable(system.mass):
-        return near, yes, yes
+        return End(near, singular, yes, yes)
     (q, v), finite = end, jnp.all(jnp.isfinite(end[0]))
     regular = lambda q: mass_is_regular(ode, q, invertible) | ~finite
     ahead = [regular(q + AHEAD**k * (t - t0) * v) for k in (1, 2, 3)]
-    return near, regular(q), ahead[0] & ahead[1] & ahead[2]
+    return End(near, singular, regular(q), ahead[0] & ahead[1] & ahead[2])
 
 
 def consistent_state(

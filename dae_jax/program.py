@@ -293,7 +293,7 @@ class Solve(eqx.Module):
 
     def _solution(self, out: Any, args: Any, rank: int | Rank | None, found: Any) -> DAESolution:
         *fields, result, event_mask = out
-        (start, _), (near, masses, masses_ahead) = found
+        (start, _), end = found
         code = result
         _, _, ts, ys, *_ = fields
         failed = lambda name, instead, when=True: RESULTS.where((code == name) & when, instead, code)
@@ -308,8 +308,11 @@ class Solve(eqx.Module):
             code = failed(RESULTS.successful, RESULTS.not_finite, ~jnp.all(jnp.stack(finite))) if finite else code
         precision = precision_of(fields[0].dtype, self.controller)
         went_well = (code == RESULTS.successful) | (code == RESULTS.event_occurred)
-        code = RESULTS.where(went_well & ~near, RESULTS.off_constraints, code)
-        code = RESULTS.where(masses & (masses_ahead | went_well), code, RESULTS.irregular_mass)
+        stuck = [RESULTS.step_rejected, RESULTS.off_manifold, RESULTS.no_convergence, RESULTS.error_too_large]
+        stuck = jnp.any(jnp.stack([code == name for name in (*stuck, RESULTS.singular_iteration_matrix)]))
+        code = RESULTS.where(stuck & end.singular, RESULTS.singular_configuration, code)
+        code = RESULTS.where(went_well & ~end.near, RESULTS.off_constraints, code)
+        code = RESULTS.where(end.masses & (end.masses_ahead | went_well), code, RESULTS.irregular_mass)
         for wrong, name in enumerate(("inconsistent_start", "dependent_constraints", "irregular_mass"), 1):
             code = RESULTS.where(start == wrong, getattr(RESULTS, name), code)
         return DAESolution(*fields, code, event_mask, args, rank[1] if isinstance(rank, tuple) else rank, precision)

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .constraints import MechanicalODE, Rank
+from .constraints import MechanicalODE, allowed_contradiction
 from .linalg import smallest_pivot
-from .normals import SparseNormals, matvec
+from .normals import Rank, SparseNormals, matvec
 
 
 # A drift that counts as large as the solution itself, as a part of this: the distance to |q| = 1 is nowhere more than |q|/2.
@@ -171,7 +171,7 @@ def rank_message(ode: MechanicalODE, found: Redundancy, given: int | Rank | None
             f"The constraints have {stands}, and more beside it: a singular configuration, as a dead centre or a stretched "
             "linkage is one, from which motion is not determined. Start from another state."
         )
-    if float(found.contradiction) > 1e-6:
+    if float(found.contradiction) > allowed_contradiction(found.contradiction.dtype):
         return (
             f"Only {rank} of the {count} constraints are independent at the start, and the others contradict them: no "
             "acceleration satisfies all. Remove the redundant constraints or make them agree."
@@ -191,7 +191,8 @@ def has_rank(ode: MechanicalODE, t: Any, y: Any, rank: Rank | None) -> tuple[Boo
         least, eps = weakest(ode, t, y), jnp.finfo(y[0].dtype).eps
         return least > eps**0.75, least > eps**0.5
     found = redundancy(ode, t, y)
-    fits = (found.holonomic == rank[0]) & (found.all == rank[1]) & found.agree & (found.contradiction <= 1e-6)
+    consistent = found.contradiction <= allowed_contradiction(y[0].dtype)
+    fits = (found.holonomic == rank[0]) & (found.all == rank[1]) & found.agree & consistent
     return fits, fits
 
 
@@ -227,7 +228,7 @@ def is_near_constraints(
 
 
 def _redundant_agree(ode: MechanicalODE, t: Any, y: Any, root: Any) -> Bool[Array, ""]:
-    """Whether those constraints that depend on others are as near as these."""
+    """Whether constraints that depend on others are off as these are: by what they have in common, not by a difference."""
     if ode.rank is None:
         return jnp.asarray(True)
     a, scale = _unit_rows(ode, t, y)
@@ -239,5 +240,5 @@ def _redundant_agree(ode: MechanicalODE, t: Any, y: Any, root: Any) -> Bool[Arra
             _, vectors = jnp.linalg.eigh(a[:rows] @ a[:rows].T)
             parts = jnp.abs(matvec(vectors.T, off))
             kept, others = jnp.max(parts[rows - rank :], initial=0), jnp.max(parts[: rows - rank], initial=0)
-            agree = agree & (others <= kept + root * (1 + jnp.max(jnp.abs(x))))
+            agree = agree & (others <= kept / 2 + root * (1 + jnp.max(jnp.abs(x))))
     return agree

@@ -28,6 +28,11 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "The mass matrix is not symmetric and positive definite, at the start or where the solve ended. A massless "
         "coordinate is for RadauIIA5() or BDF() with GGL() or Residual(...), and for DummyDerivatives()."
     )
+    singular_configuration = (
+        "The constraints become dependent where the solve ended: a singular configuration, such as a dead centre or a "
+        "linkage at the end of its reach, beyond which the motion does not exist or is not determined. Stop before it "
+        "(`event`), or change what drives it there."
+    )
     off_constraints = (
         "The solution does not satisfy the constraints at its end: it has drifted off by as much as its own size, "
         "constraints that were redundant contradict each other, or one has become singular. Use a method that keeps the "
@@ -43,8 +48,8 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
     step_rejected = (
         "The step size went to the resolution of time: at the last time reached the force is not finite, the "
-        "constraints become dependent (a singular configuration) or jump, or the equations do not determine all "
-        "derivatives (`dae_jax.analyse` says so)."
+        "constraints become dependent (a singular configuration), contradict each other or jump, or the equations do not "
+        "determine all derivatives (`dae_jax.analyse` says so)."
     )
     off_manifold = (
         "The nonlinear equations of a step had no solution within reach: the step is too large for the manifold's "
