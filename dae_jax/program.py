@@ -292,9 +292,8 @@ class Solve(eqx.Module):
         return sol.t0, sol.t1, ts["user"], ys["user"], interpolation, stats, result, sol.event_mask, end
 
     def _solution(self, out: Any, args: Any, rank: int | Rank | None, found: Any) -> DAESolution:
-        *fields, result, event_mask = out
+        *fields, code, event_mask = out
         (start, _), end = found
-        code = result
         _, _, ts, ys, *_ = fields
         failed = lambda name, instead, when=True: RESULTS.where((code == name) & when, instead, code)
         if isinstance(self.formulation, Residual):
