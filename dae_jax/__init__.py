@@ -1,8 +1,18 @@
 """Differentiable solvers for differential-algebraic equations in JAX."""
 
+import importlib as _importlib
+import importlib.metadata as _metadata
+from typing import Any as _Any
+
 from .analyse import Structure as Structure, analyse as analyse
 from .baumgarte_loss import BaumgarteLoss as BaumgarteLoss, baumgarte_loss as baumgarte_loss
-from .diagnostics import Drift as Drift, drift as drift, energy as energy, multipliers as multipliers
+from .diagnostics import (
+    Drift as Drift,
+    EquationDrift as EquationDrift,
+    drift as drift,
+    energy as energy,
+    multipliers as multipliers,
+)
 from .explain import (
     MechanicalPlan as MechanicalPlan,
     Plan as Plan,
@@ -43,3 +53,19 @@ from .systems import (
     SemiExplicitDAE as SemiExplicitDAE,
 )
 from .tune import Tuned as Tuned, tune as tune
+
+
+_MODULES = ("plotting", "reductions", "scenes")
+
+
+def __getattr__(name: str) -> _Any:
+    """Modules that are imported when they are used, and the version."""
+    if name in _MODULES:
+        return _importlib.import_module(f".{name}", __name__)
+    if name == "__version__":
+        return _metadata.version(__name__)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_MODULES, "__version__"])

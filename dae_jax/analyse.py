@@ -12,9 +12,11 @@ from jaxtyping import Array, Float
 
 from .offsets import Offsets, Slopes, find_offsets
 from .residual import ResidualForm
+from .states import counted, refuse_wrong_state
 from .structure import Block, block_triangular, pantelides
-from .systems import System
+from .systems import ConstrainedSystem, System
 from .taylor import total_derivatives
+from .user_functions import refuse_wrong_functions
 
 
 # A system of more variables is summed up in words; its incidence matrix would not fit a page.
@@ -30,7 +32,8 @@ class Structure:
     - `signature`: for each equation, its variables with the highest derivative that occurs: 0 or 1, more in a combination
       with derivatives of equations.
     - `index`: the structural index, an upper bound of the `differential_index` where `regular`.
-    - `degrees_of_freedom`: how many initial values can be chosen.
+    - `degrees_of_freedom`: how many initial values can be chosen; of a mechanism, whose positions and velocities both are
+      initial values, `mechanical_degrees_of_freedom` is the engineer's count, the velocities that can be chosen.
     - `equation_offsets`, `variable_offsets`: c and d; equation i is to be differentiated cᵢ times, and then determines
       derivatives up to the order dⱼ of variable j (Pryce's Σ-method).
     - `pantelides_offsets`: how often Pantelides' algorithm differentiates each equation; the same where its result is
@@ -78,6 +81,13 @@ class Structure:
         return sum(map(len, self.signature))
 
     @property
+    def mechanical_degrees_of_freedom(self) -> int | None:
+        """Coordinates minus constraints, for a `ConstrainedSystem`; `None` for other systems."""
+        if not isinstance(self.form.system, ConstrainedSystem):
+            return None
+        return self.form.layout.size // 2 - self.form.extra
+
+    @property
     def bandwidth(self) -> int:
         """The greatest distance of an entry from the diagonal."""
         return max((abs(i - j) for i, row in enumerate(self.signature) for j in row), default=0)
@@ -123,9 +133,13 @@ class Structure:
         return tuple((self.equations[i], k) for i, c in enumerate(self.equation_offsets) for k in range(c))
 
     def __str__(self) -> str:
+        freedom = counted(self.degrees_of_freedom, "initial value") + " to choose"
+        if self.mechanical_degrees_of_freedom is not None:
+            many = ("degree of freedom of the mechanism", "degrees of freedom of the mechanism")
+            freedom = f"{counted(self.mechanical_degrees_of_freedom, *many)} ({freedom})"
         lines = [
-            f"{len(self.equations)} equations, index {self.index}, {self.degrees_of_freedom} degrees of freedom, "
-            f"{len(self.blocks)} blocks, {self.nonzeros} nonzeros, bandwidth {self.bandwidth}",
+            f"{counted(len(self.equations), 'equation')}, index {self.index}, {freedom}, "
+            f"{counted(len(self.blocks), 'block')}, {counted(self.nonzeros, 'nonzero')}, bandwidth {self.bandwidth}",
         ]
         if not self.regular:
             lines.append(
@@ -164,7 +178,9 @@ def analyse(system: System, t0: Any, y0: Any, args: Any = None) -> Structure:
     Errors: `ValueError` for a structurally singular system, naming the equations that have too few variables and the
     variables that have too few equations.
     """
+    refuse_wrong_state(system, y0)
     y0 = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
+    refuse_wrong_functions(system, t0, y0, args)
     form = ResidualForm.of(system, t0, y0, args)
     y = form.encode(y0)
     point = jnp.asarray(t0, y.dtype), y

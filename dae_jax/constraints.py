@@ -18,9 +18,24 @@ from jaxtyping import Array, Bool, Float
 
 from .kernels import scalarise, subroutine
 from .linalg import fixed_point, implicit_root, relative_change, solve
-from .normals import SPARSE_FROM, DenseNormals, SparseNormals, constraint_pattern, mass_solve, matvec, sparse_normals
+from .normals import (
+    SPARSE_FROM,
+    DenseNormals,
+    Rank,
+    SparseNormals,
+    constraint_pattern,
+    mass_solve,
+    matvec,
+    sparse_normals,
+    unit_diagonal,
+)
 from .structure.layout import Layout
 from .systems import ConstrainedSystem
+
+
+def allowed_contradiction(dtype: Any) -> float:
+    """The part of the accelerations that dependent constraints ask for in which they may disagree."""
+    return max(1e-6, float(jnp.finfo(dtype).eps) ** 0.5)
 
 
 def at_one_instant(method: Callable[..., Any]) -> Callable[..., Any]:
@@ -100,7 +115,9 @@ class MechanicalODE(ManifoldODE):
     linear: DenseNormals | SparseNormals = eqx.field(static=True)
 
     @classmethod
-    def of(cls, system: ConstrainedSystem, t: Any, state: Any, args: Any, rank: int | None = None) -> "MechanicalODE":
+    def of(
+        cls, system: ConstrainedSystem, t: Any, state: Any, args: Any, rank: int | Rank | None = None
+    ) -> "MechanicalODE":
         """Finds, while tracing, what the system has and has not; `state` = (q, v) gives shapes and types only."""
         q, v = state
         system, args = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, (system, args))
@@ -108,7 +125,9 @@ class MechanicalODE(ManifoldODE):
         g, g_uses_time = _outline(system.constraint, t, q, args)
         h, h_uses_time = _outline(system.nonholonomic, t, q, v, args)
         rank = system.rank if rank is None else rank
-        rank = None if rank == g + h else rank
+        if isinstance(rank, int):
+            rank = (rank if not h else max(rank - h, 0), rank)
+        rank = None if rank == (g, g + h) else rank
         ode = cls(system, args, layout, g, h, (g_uses_time, h_uses_time), DenseNormals(g, h, rank))
         sparse = ode._sparse(t, layout.flatten(q)) if h == 0 and g >= SPARSE_FROM and rank is None else None
         return ode if sparse is None else dataclasses.replace(ode, linear=sparse)
@@ -119,8 +138,8 @@ class MechanicalODE(ManifoldODE):
         return None if pattern is None else sparse_normals(pattern)
 
     @property
-    def rank(self) -> int | None:
-        """How many constraints are independent, where some are redundant."""
+    def rank(self) -> Rank | None:
+        """How many constraints are independent, where some are redundant: of the holonomic ones, and of all."""
         return self.linear.rank if isinstance(self.linear, DenseNormals) else None
 
     def decode(self, t: Any, y: Any) -> Any:
@@ -139,10 +158,21 @@ class MechanicalODE(ManifoldODE):
         flat = self.layout.unflatten
         return self.layout.flatten(self.system.force(t, flat(q), flat(v), self.args)).astype(q.dtype)
 
-    def mass(self, q: Float[Array, " n"]) -> Float[Array, "..."] | None:
-        """M(q): `None`, a vector (diagonal) or a matrix."""
+    def unchecked_mass(self, q: Float[Array, " n"]) -> Float[Array, "..."] | None:
+        """M(q) as the system has it: `None`, a vector (diagonal) or a matrix."""
         mass = self.system.mass_matrix(self.layout.unflatten(q), self.args)
         return None if mass is None else mass.astype(q.dtype)
+
+    def mass(self, q: Float[Array, " n"]) -> Float[Array, "..."] | None:
+        """M(q); NaN where a function has made a mass negative or a matrix asymmetric: methods use one triangle."""
+        mass = self.unchecked_mass(q)
+        if mass is None or not callable(self.system.mass):
+            return mass
+        sizes = jax.lax.stop_gradient(mass)
+        if mass.ndim < 2:
+            return jnp.where(sizes >= 0, mass, jnp.nan)
+        off = jnp.max(jnp.abs(sizes - sizes.T)) <= jnp.finfo(q.dtype).eps ** 0.75 * jnp.max(jnp.abs(sizes))
+        return jnp.where(off, mass, jnp.nan)
 
     def constraint(self, t: Any, q: Float[Array, " n"]) -> Float[Array, " m"]:
         """g(t, q)."""
@@ -203,8 +233,21 @@ class MechanicalODE(ManifoldODE):
         target = self.bias(t, q, v)
         if feedback is not None:
             target = target + self._feedback(t, q, v, feedback)
-        multipliers = self.linear.gram_solve(self, normals, self.linear.along(self, normals, free) + target)
-        return free - self.linear.lift(self, normals, multipliers), multipliers
+        target = self.linear.along(self, normals, free) + target
+        multipliers = self.linear.gram_solve(self, normals, target)
+        pulled = self.linear.lift(self, normals, multipliers)
+        if self.rank is not None:
+            pulled = self._unless_contradictory(t, (q, v), normals, target, pulled)
+        return free - pulled, multipliers
+
+    def _unless_contradictory(self, t: Any, y: Any, normals: Any, target: Any, pulled: Any) -> Any:
+        """x = M⁻¹Aᵀλ, or NaN where it leaves more of A x = b than y is off the constraints: dependent ones disagree."""
+        lengths = self.linear.lengths(normals)
+        lengths = jnp.where(lengths > 0, lengths, 1)
+        off = jnp.max(jnp.abs(self.linear.along(self, normals, pulled) - target) / lengths)
+        drift = jnp.max(jnp.concatenate(self.distances(t, y)))
+        allowed = (allowed_contradiction(drift.dtype) + 10 * drift) * (1 + jnp.max(jnp.abs(target) / lengths))
+        return jnp.where(off <= allowed, pulled, jnp.nan)
 
     def _feedback(self, t: Any, q: Any, v: Any, feedback: Any) -> Float[Array, " mp"]:
         velocity = self.velocity_constraint(t, q, v)
@@ -216,6 +259,14 @@ class MechanicalODE(ManifoldODE):
         return jnp.concatenate(terms) if len(terms) > 1 else terms[0]
 
     # The manifold
+
+    @at_one_instant
+    def distances(self, t: Any, y: Any) -> tuple[Float[Array, " m"], Float[Array, " mp"]]:
+        """The invariants divided by the length of each constraint's gradient: about how far y is from satisfying them."""
+        lengths = self.linear.lengths(self.normals(t, y))
+        lengths = jnp.where(lengths > 0, lengths, 1)
+        g, velocity = self.invariants(t, y)
+        return jnp.abs(g) / lengths[: self.holonomic], jnp.abs(velocity) / lengths
 
     @at_one_instant
     def invariants(self, t: Any, y: Any) -> tuple[Float[Array, " m"], Float[Array, " mp"]]:
@@ -264,7 +315,14 @@ class MechanicalODE(ManifoldODE):
         params = (self, t, y, normals, tuple(jax.lax.stop_gradient(first)))
         linear_solve = solve if self.rank is None else _minimum_norm
         mu, found = implicit_root(_manifold_residual, iterate, params, linear_solve=linear_solve)
-        return self.shift(y, normals, mu), found
+        landed = self.shift(y, normals, mu)
+        return landed, found if self.rank is None else found & self._all_hold(t, landed)
+
+    def _all_hold(self, t: Any, y: Any) -> Bool[Array, ""]:
+        """Whether the constraints hold that depend on others: Newton's corrections ask for as many as are independent."""
+        root = jnp.finfo(y[0].dtype).eps ** 0.5
+        near = [jnp.all(d <= root * (1 + jnp.max(jnp.abs(x)))) for d, x in zip(self.distances(t, y), y, strict=True)]
+        return near[0] & near[1]
 
     @at_one_instant
     def correction(self, t: Any, y: Any, normals: Any, mu: Float[Array, " c"]) -> tuple[Float[Array, " c"], Any]:
@@ -291,7 +349,10 @@ def _manifold_residual(mu: Float[Array, " c"], params: Any) -> Float[Array, " c"
 
 def _minimum_norm(a: Float[Array, "c c"], b: Float[Array, " c"]) -> Float[Array, " c"]:
     # The relative cut-off separates redundancy from conditioning: on the manifold the dependent rows agree to round-off.
-    return matvec(jnp.linalg.pinv(a, rtol=float(jnp.finfo(a.dtype).eps) ** 0.5), b)
+    # Constraints may have any scale.
+    scale = unit_diagonal(a)
+    inverse = jnp.linalg.pinv(a * scale[:, None] * scale, rtol=float(jnp.finfo(a.dtype).eps) ** 0.5)
+    return scale * matvec(inverse, scale * b)
 
 
 def _outline(function: Callable[..., Any] | None, *args: Any) -> tuple[int, bool]:

@@ -1,14 +1,23 @@
-"""What a solution does with its constraints, its energy and its multipliers."""
+"""What a solution does with its constraints, its energy and its multipliers.
 
-from typing import Any, NamedTuple
+Each is an array over `sol.ts`. At times that are padding, of a solve that ended early or saved its steps, it has its last
+value: largest, smallest and final values are then those of the saved times. A batch of solutions has a leading axis more.
+"""
 
+from collections.abc import Callable
+from typing import Any, NamedTuple, overload
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .constraints import MechanicalODE
-from .solution import DAESolution
-from .systems import ConstrainedSystem
+from .residual_drift import EquationDrift, equation_drift
+from .solution import DAESolution, without_padding
+from .states import brief, refuse_wrong_state, refuse_wrong_system
+from .systems import ConstrainedSystem, System
+from .user_functions import refuse_no_real_number, refuse_wrong_functions, returned
 
 
 class Drift(NamedTuple):
@@ -17,16 +26,31 @@ class Drift(NamedTuple):
     position: Float[Array, " times"]
     velocity: Float[Array, " times"]
 
+    @property
+    def levels(self) -> tuple[Float[Array, " times"], ...]:
+        """Both, level by level, as `EquationDrift` has them."""
+        return tuple(self)
 
-def drift(system: ConstrainedSystem, sol: DAESolution) -> Drift:
-    """How far each saved state is off the constraints, and off their first derivative."""
 
-    def largest(t: Any, y: Any) -> tuple[Any, Any]:
-        ode = MechanicalODE.of(system, t, y, sol.args)
+def drift(system: System, sol: DAESolution) -> Drift | EquationDrift:
+    """How far each saved state is off the constraints, and off the hidden ones.
+
+    Of a `ConstrainedSystem`, a `Drift`. Of other systems an `EquationDrift`: `levels[0]` is the largest of |F| at each saved
+    time, for the ẏ with which F(t, y, ẏ) = 0 holds best, so of algebraic equations what they are off by; `levels[k]` the
+    largest of the k-th derivatives of F that restrict y, the hidden constraints.
+
+    Errors: `ValueError` for a solution without saved states.
+    """
+    refuse_wrong_system(system)
+    if not isinstance(system, ConstrainedSystem):
+        return EquationDrift(_at_saved_times(system, sol, lambda t, y, args: equation_drift(system, t, y, args)))
+
+    def largest(t: Any, y: Any, args: Any) -> tuple[Any, Any]:
+        ode = MechanicalODE.of(system, t, y, args)
         g, dg = ode.invariants(t, ode.encode(y))
         return jnp.max(jnp.abs(g), initial=0), jnp.max(jnp.abs(dg), initial=0)
 
-    return Drift(*jax.vmap(largest)(sol.ts, sol.ys))
+    return Drift(*_at_saved_times(system, sol, largest))
 
 
 def energy(system: ConstrainedSystem, sol: DAESolution) -> Float[Array, " times"]:
@@ -34,25 +58,86 @@ def energy(system: ConstrainedSystem, sol: DAESolution) -> Float[Array, " times"
 
     Errors: `ValueError` where the system has no `potential`.
     """
-    if system.potential is None:
+    if getattr(system, "potential", None) is None:
         raise ValueError("The energy needs `ConstrainedSystem(..., potential=lambda q, args: ...)`.")
-    potential = system.potential
+    potential: Any = system.potential
 
-    def total(q: Any, v: Any) -> Any:
-        ode = MechanicalODE.of(system, 0.0, (q, v), sol.args)
-        flat_q, flat_v = ode.encode((q, v))
+    def total(t: Any, y: Any, args: Any) -> Any:
+        call = "potential(q, args)"
+        refuse_no_real_number(returned(call, potential, y[0], args), call)
+        ode = MechanicalODE.of(system, t, y, args)
+        flat_q, flat_v = ode.encode(y)
         mass = ode.mass(flat_q)
         momentum = flat_v if mass is None else mass * flat_v if mass.ndim < 2 else jnp.dot(mass, flat_v)
-        return jnp.dot(flat_v, momentum) / 2 + potential(q, sol.args)
+        return jnp.dot(flat_v, momentum) / 2 + potential(y[0], args)
 
-    return jax.vmap(total)(*sol.ys)
+    return _at_saved_times(system, sol, total)
 
 
-def multipliers(system: ConstrainedSystem, sol: DAESolution) -> Float[Array, "times mp"]:
-    """(λ, μ) at each saved time: the constraint forces are −Gᵀλ − Hᵀμ. Of least norm where constraints are redundant."""
+@overload
+def multipliers(system: ConstrainedSystem, sol: DAESolution, /) -> Float[Array, "times mp"]: ...
 
-    def at(t: Any, y: Any) -> Any:
-        ode = MechanicalODE.of(system, t, y, sol.args, sol.rank)
-        return ode.multipliers(t, ode.encode(y))
 
-    return jax.vmap(at)(sol.ts, sol.ys)
+@overload
+def multipliers(system: ConstrainedSystem, t: Any, q: Any, v: Any, args: Any = None, /) -> Float[Array, " mp"]: ...
+
+
+def multipliers(system: ConstrainedSystem, *at: Any) -> Any:
+    """(λ, μ): the constraint forces are −Gᵀλ − Hᵀμ. Of least norm where constraints are redundant.
+
+    `multipliers(system, sol)` gives them at each saved time, `multipliers(system, t, q, v, args)` at a point: any JAX
+    function, so that the condition of an event can use it; it costs one evaluation of the accelerations. Where constraints
+    are redundant, the point form needs `ConstrainedSystem(..., rank=...)`.
+
+    Errors: `ValueError` for a system that is no `ConstrainedSystem`: there, multipliers are among the unknowns.
+    """
+    refuse_wrong_system(system)
+    if not isinstance(system, ConstrainedSystem):
+        raise ValueError(
+            f"`multipliers` takes a ConstrainedSystem; those of this {type(system).__name__} are among its unknowns, in `sol.ys`."
+        )
+    if len(at) == 1:
+        (sol,) = at
+        return _at_saved_times(system, sol, lambda t, y, args: _multipliers(system, t, y, args, sol.rank))
+    if len(at) not in (3, 4):
+        raise TypeError("`multipliers` takes (system, sol) or (system, t, q, v, args).")
+    t, q, v, *args = at
+    state = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), (q, v))
+    refuse_wrong_state(system, state)
+    return _multipliers(system, t, state, args[0] if args else None, system.rank)
+
+
+def _multipliers(system: ConstrainedSystem, t: Any, y: Any, args: Any, rank: Any) -> Float[Array, " mp"]:
+    ode = MechanicalODE.of(system, t, y, args, rank)
+    return ode.multipliers(t, ode.encode(y))
+
+
+def _at_saved_times(system: System, sol: DAESolution, of: Callable[..., Any]) -> Any:
+    """of(t, y, args) at each saved time."""
+    if not isinstance(sol, DAESolution):
+        raise TypeError(f"`sol` must be what `daesolve` returns, but is {brief(sol)}.")
+    if not isinstance(sol.ts, jax.Array):
+        raise ValueError(
+            "`sol` must have saved states: `SaveAt(t1=True)` or `SaveAt(ts=...)`, without `subs`. Of a solution with several "
+            "parts take one, `dataclasses.replace(sol, ts=sol.ts[0], ys=sol.ys[0])`."
+        )
+
+    def along(ts: Any, ys: Any, args: Any) -> Any:
+        if ts.ndim > 1:
+            return eqx.filter_vmap(along)(ts, ys, args)
+        _refuse_no_states(system, ts, ys, args)
+        return jax.vmap(lambda t, y: of(t, y, args))(*without_padding(ts, ys))
+
+    return along(sol.ts, sol.ys, sol.args)
+
+
+def _refuse_no_states(system: System, ts: Any, ys: Any, args: Any) -> None:
+    one = jax.tree.map(lambda y: jax.ShapeDtypeStruct(y.shape[1:], y.dtype), ys)
+    try:
+        refuse_wrong_state(system, one, "sol.ys")
+        refuse_wrong_functions(system, ts[0], one, args)
+    except (TypeError, ValueError) as refusal:
+        raise ValueError(
+            "`sol.ys` must hold states of `system`: leave out `SaveAt(fn=...)`, and take the system that was solved.\n"
+            f"({refusal})"
+        ) from refusal

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .checks import refuse_bad_start
+from .checks import refuse_bad_start, refuse_no_time
 from .constraints import MechanicalODE
 from .formulations import AbstractFormulation, DummyDerivatives, Residual
 from .kernels import equations, hindrances, one_kernel_enabled, without_checks
@@ -18,7 +18,9 @@ from .normals import SparseNormals
 from .pencil import Pencil
 from .program import Solve
 from .residual import ResidualForm
+from .solution import precision_of
 from .solve import prepared
+from .states import counted
 from .systems import ConstrainedSystem
 from .underlying import StructuralODE
 
@@ -28,6 +30,7 @@ class Plan:
     """How a system is solved; `print` it. `explain` gives a `MechanicalPlan`, a `StructuralPlan` or a `ResidualPlan`.
 
     - `method`: formulation and solver, in words.
+    - `precision`: the numbers' type, and the tolerances.
     - `linear_solver`: how the linear systems of a step are solved.
     - `operations`: primitive operations of one evaluation of the field or the residual, as it is compiled.
     - `one_kernel`: whether the whole loop is compiled to one kernel; `hindrances`: the primitives that prevent it.
@@ -35,6 +38,7 @@ class Plan:
     """
 
     method: str
+    precision: str
     linear_solver: str
     operations: int
     one_kernel: bool
@@ -45,6 +49,7 @@ class Plan:
         kernel = "yes" if self.one_kernel else "no: " + (", ".join(self.hindrances) or "switched off, or not on a CPU")
         rows = {
             "method": self.method,
+            "precision": self.precision,
             **self._found(),
             "one kernel": kernel,
             "left out": "; ".join(self.left_out) or "nothing",
@@ -79,14 +84,14 @@ class MechanicalPlan(Plan):
         redundant = "" if independent == self.constraints else f", {independent} of them independent"
         jacobian = "dense, by forward-mode derivatives"
         if self.colours is not None:
-            jacobian = f"{self.nonzeros} nonzeros from {self.colours} directional derivatives"
+            jacobian = f"{counted(self.nonzeros, 'nonzero')} from {counted(self.colours, 'directional derivative')}"
         return {
-            "system": f"{self.coordinates} coordinates, {self.constraints} constraints{redundant}",
+            "system": f"{counted(self.coordinates, 'coordinate')}, {counted(self.constraints, 'constraint')}{redundant}",
             "mass": self.mass,
             "time": f"constraints {'depend on' if self.constraints_depend_on_time else 'are fixed in'} time",
             "constraint Jacobian": jacobian,
             "multipliers": self.linear_solver,
-            "field": f"{self.operations} operations",
+            "field": counted(self.operations, "operation"),
         }
 
 
@@ -105,12 +110,16 @@ class StructuralPlan(Plan):
     invariants: int
 
     def _found(self) -> dict[str, str]:
-        often = [f"{self.differentiated.count(k)} of them {k} times" for k in sorted(set(self.differentiated)) if k]
+        often = [
+            f"{self.differentiated.count(k)} of them {counted(k, 'time')}"
+            for k in sorted(set(self.differentiated))
+            if k
+        ]
         return {
-            "system": f"{self.unknowns} equations, differentiated: {', '.join(often) or 'none'}",
-            "underlying ODE": f"{self.state} numbers with {self.invariants} invariants",
+            "system": f"{counted(self.unknowns, 'equation')}, differentiated: {', '.join(often) or 'none'}",
+            "underlying ODE": f"{counted(self.state, 'number')} with {counted(self.invariants, 'invariant')}",
             "linear systems": self.linear_solver,
-            "field": f"{self.operations} operations",
+            "field": counted(self.operations, "operation"),
         }
 
 
@@ -132,11 +141,11 @@ class ResidualPlan(Plan):
         counts = [f"{self.indices.count(k)} of index {k}" for k in sorted(set(self.indices))]
         by_y, by_rate = self.colours
         return {
-            "system": f"{self.unknowns} unknowns, derivatives of {self.derivatives} occur",
+            "system": f"{counted(self.unknowns, 'unknown')}, derivatives of {self.derivatives} occur",
             "unknowns": ", ".join(counts),
-            "Jacobians": f"∂F/∂y from {by_y} directional derivatives, ∂F/∂ẏ from {by_rate}",
+            "Jacobians": f"∂F/∂y from {counted(by_y, 'directional derivative')}, ∂F/∂ẏ from {by_rate}",
             "linear systems": self.linear_solver,
-            "residual": f"{self.operations} operations",
+            "residual": counted(self.operations, "operation"),
         }
 
 
@@ -158,6 +167,7 @@ def explain(
 
     Errors: those of `daesolve` for wrong input.
     """
+    refuse_no_time("t0", t0)
     dt0 = None if isinstance(solver, diffrax.AbstractAdaptiveSolver) else 1e-3
     inputs = prepared(
         system, solver, t0, t0 + 1.0, dt0, y0, args, formulation, saveat, stepsize_controller, adjoint, event, 4096,
@@ -166,19 +176,23 @@ def explain(
     inputs = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray | np.generic) else x, inputs)
     solve, system, t0, _, _, y0, args = inputs
     traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(inputs))
-    rank = system.rank if traced else refuse_bad_start(system, t0, y0, args)
+    invertible = solve.formulation.inverts_mass
+    rank = getattr(system, "rank", None) if traced else refuse_bad_start(system, t0, y0, args, invertible)
+    solve.refuse_wrong_functions(*inputs[1:])
+    precision = precision_of(t0.dtype, solve.controller)
     kernel, arrays = solve.kernel(*inputs[1:], rank)
     found = hindrances(jax.make_jaxpr(without_checks(kernel))(arrays))
     enabled = one_kernel_enabled() and jax.default_backend() == "cpu" and solve.derivative() != "any"
     method = f"{_name(formulation or solve.formulation)}, {_name(solver)}"
     if isinstance(solve.formulation, Residual):
         y, pencil = solve.formulation.encode(system, t0, y0, args)
-        return _of_residual(pencil, t0, y, method, enabled and not found, found)
+        return _of_residual(pencil, t0, y, method, precision, enabled and not found, found)
     if isinstance(solve.formulation, DummyDerivatives) or not isinstance(system, ConstrainedSystem):
         ode = StructuralODE.of(ResidualForm.of(system, t0, y0, args), t0.dtype)
         y = jax.eval_shape(ode.encode, t0, y0)
         return StructuralPlan(
             method=method,
+            precision=precision,
             linear_solver=ode.tearing.describe(ode.form.size),
             operations=_operations(lambda y: ode.field(t0, y), y),
             one_kernel=enabled and not found,
@@ -195,14 +209,15 @@ def explain(
     y = ode.encode(y0)
     return MechanicalPlan(
         method=method,
-        linear_solver=_linear_solver(ode, count, rank),
+        precision=precision,
+        linear_solver=_linear_solver(ode, count),
         operations=_operations(lambda y: ode.field(t0, y), y),
         one_kernel=enabled and not found,
         hindrances=found,
         left_out=tuple(_left_out(ode, solve)),
         coordinates=ode.layout.size,
         constraints=count,
-        independent=None if traced else rank or count,
+        independent=None if traced else rank[1] if rank else count,
         mass=_mass(system, ode.mass(y[0])),
         constraints_depend_on_time=any(ode.depends_on_time),
         nonzeros=None if sparse is None else int((sparse.columns >= 0).sum()),
@@ -211,12 +226,13 @@ def explain(
 
 
 def _of_residual(
-    pencil: Pencil, t0: Any, y: Any, method: str, one_kernel: bool, found: tuple[str, ...]
+    pencil: Pencil, t0: Any, y: Any, method: str, precision: str, one_kernel: bool, found: tuple[str, ...]
 ) -> ResidualPlan:
     outline, n = pencil.outline, y.size
     colours = tuple(n if c is None else len(c.seeds) for c in (outline.by_y, outline.by_rate))
     return ResidualPlan(
         method=method,
+        precision=precision,
         linear_solver=outline.storage.describe(),
         operations=_operations(lambda y: pencil.residual(t0, y, y), y),
         one_kernel=one_kernel,
@@ -239,16 +255,16 @@ def _mass(system: Any, mass: Any) -> str:
     return kind + (" that depend on q" if callable(system.mass) else "")
 
 
-def _linear_solver(ode: MechanicalODE, count: int, rank: int | None) -> str:
+def _linear_solver(ode: MechanicalODE, count: int) -> str:
     if isinstance(ode.linear, SparseNormals):
         gram = ode.linear.gram
-        return f"sparse elimination in {len(gram.levels)} levels, {gram.cost} multiplications" + (
+        return f"sparse elimination in {counted(len(gram.levels), 'level')}, {counted(gram.cost, 'multiplication')}" + (
             f", then a dense system of {gram.rest_size}" if gram.rest_size > 1 else ""
         )
-    if rank is not None:
-        return f"least norm by eigenvalues, rank {rank} of {count} (LAPACK)"
+    if ode.rank is not None:
+        return f"least norm by eigenvalues, rank {ode.rank[1]} of {count} (LAPACK)"
     kind = "straight-line" if count <= UNROLLED else "a loop over columns" if count <= LOOPED else "Cholesky (LAPACK)"
-    return f"dense elimination of {count} unknowns, {kind}"
+    return f"dense elimination of {counted(count, 'unknown')}, {kind}"
 
 
 def _left_out(ode: MechanicalODE, solve: Solve) -> Iterator[str]:

@@ -6,15 +6,24 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from .constraints import MechanicalODE
-from .linalg import fixed_point, implicit_root, relative_change, smallest_pivot
-from .normals import SparseNormals, mass_solve
+from .linalg import fixed_point, implicit_root, relative_change
+from .normals import Rank, mass_solve
 from .pencil import Pencil
+from .regularity import has_rank, is_near_constraints, mass_is_regular, weakest
 from .residual import ResidualForm
+from .states import broadcast_to_state, refuse_wrong_state
 from .systems import ConstrainedSystem, System
 from .underlying import StructuralODE
+from .user_functions import refuse_wrong_functions
+
+
+# What part of the interval a solve that failed is looked on beyond its end; and the second and third power of it.
+AHEAD = 1e-3
+# A smallest pivot below this power of round-off is that of constraints that become dependent.
+SINGULAR = 3 / 8
 
 
 class Violation(eqx.Module):
@@ -49,15 +58,9 @@ class Violation(eqx.Module):
 def violation(ode: MechanicalODE, t: Any, y: Any) -> Violation:
     """How far the flat state y = (q, v) is from the manifold."""
     q, v = y
-    residuals = ode.invariants(t, y)
-    lengths = ode.linear.lengths(ode.normals(t, y))
-    lengths = jnp.where(lengths > 0, lengths, 1)
-    distances = tuple(
-        jnp.abs(r) / length for r, length in zip(residuals, (lengths[: ode.holonomic], lengths), strict=True)
-    )
     root = jnp.finfo(q.dtype).eps ** 0.5
     allowed = tuple(root * (1 + jnp.max(jnp.abs(x))) for x in (q, v))
-    return Violation(residuals, distances, allowed)
+    return Violation(ode.invariants(t, y), ode.distances(t, y), allowed)
 
 
 class Unsolved(eqx.Module):
@@ -102,51 +105,53 @@ def _left_over(ode: StructuralODE, t: Any, y: Float[Array, " N"]) -> Unsolved:
     return Unsolved(ode.violations(t, y), jnp.finfo(y.dtype).eps ** 0.5 * terms, ode.invariant_names)
 
 
-class Redundancy(eqx.Module):
-    """`rank`: how many constraints are independent; `contradiction`: the part of the accelerations' right-hand side that
-    no multipliers can satisfy, relative to its size.
+def look_at_start(
+    system: System, t: Any, state: Any, args: Any, rank: int | Rank | None, invertible: bool
+) -> tuple[Int[Array, ""], Bool[Array, ""]]:
+    """What is wrong with a start: 0 for nothing, 1: it is inconsistent, 2: the constraints have not the given rank (`None`:
+    all are independent), 3: the masses; and whether nothing is wrong beyond doubt. `invertible`: whether M must be.
     """
-
-    rank: Any
-    contradiction: Float[Array, ""]
-
-
-def redundancy(ode: MechanicalODE, t: Any, y: Any) -> Redundancy:
-    """Whether constraints depend on each other at the flat state y = (q, v)."""
-    q, v = y
-    a, scale, schur = _scaled_gram(ode, t, y)
-    eigenvalues, vectors = jnp.linalg.eigh(schur)
-    independent = eigenvalues > jnp.finfo(q.dtype).eps ** 0.5 * jnp.max(eigenvalues)
-    target = (jnp.dot(a, mass_solve(ode.mass(q), ode.force(t, q, v))) + ode.bias(t, q, v)) * scale
-    dependent = jnp.where(independent, 0, jnp.dot(vectors.T, target))
-    contradiction = jnp.max(jnp.abs(dependent)) / (1 + jnp.max(jnp.abs(target)))
-    return Redundancy(jnp.sum(independent), contradiction)
-
-
-def _scaled_gram(ode: MechanicalODE, t: Any, y: Any) -> tuple[Array, Array, Array]:
-    """A, the inverse lengths of its rows, and A M⁻¹Aᵀ for rows of length 1."""
-    q, v = y
-    a = ode.constraint_jacobian(t, q, v)
-    lengths = jnp.sqrt(jnp.sum(a * a, 1))
-    scale = 1 / jnp.where(lengths > 0, lengths, 1)
-    return a, scale, jnp.dot(a, mass_solve(ode.mass(q), a.T)) * scale[:, None] * scale[None, :]
-
-
-def start_is_as_expected(
-    system: System, t: Any, state: Any, args: Any, rank: int | None
-) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-    """Whether a state is consistent, and whether moreover the constraints have the given rank (`None`: all independent)."""
     if not isinstance(system, ConstrainedSystem):
         consistent = unsolved(system, t, state, args).consistent()
-        return consistent, consistent
+        return jnp.where(consistent, 0, 1), consistent
     ode = MechanicalODE.of(system, t, state, args, rank)
     y = ode.encode(state)
-    consistent = violation(ode, t, y).consistent()
-    if isinstance(ode.linear, SparseNormals):
-        return consistent, consistent
-    if rank is not None:
-        return consistent, consistent & (redundancy(ode, t, y).rank == rank)
-    return consistent, consistent & (smallest_pivot(_scaled_gram(ode, t, y)[2]) > jnp.finfo(y[0].dtype).eps ** 0.5)
+    consistent, regular = violation(ode, t, y).consistent(), mass_is_regular(ode, y[0], invertible)
+    fits, surely = has_rank(ode, t, y, ode.rank)
+    wrong = jnp.where(regular, jnp.where(consistent, jnp.where(fits, 0, 2), 1), 3)
+    return wrong, (wrong == 0) & surely
+
+
+class End(eqx.Module):
+    """What a mechanism's state at the end of a solve says: whether it satisfies the constraints (see `is_near_constraints`)
+    and these nearly depend on each other; whether the masses are regular there, and also beyond, where a solve that failed
+    did not get.
+    """
+
+    near: Bool[Array, ""]
+    singular: Bool[Array, ""]
+    masses: Bool[Array, ""]
+    masses_ahead: Bool[Array, ""]
+
+
+def look_at_end(
+    system: System, t0: Any, start: Any, args: Any, rank: int | Rank | None, invertible: bool, end: Any, keeps: Any,
+    tolerances: Any, residual: bool,
+) -> End:  # fmt: skip
+    """The state (t, y) at the `end` of a solve."""
+    yes = jnp.asarray(True)
+    if not isinstance(system, ConstrainedSystem):
+        return End(yes, ~yes, yes, yes)
+    ode = MechanicalODE.of(system, t0, start, args, rank)
+    start, (t, end) = ode.encode(start), (end[0], ode.encode(end[1]))
+    near = is_near_constraints(ode, t, start, end, keeps, tolerances, residual)
+    singular = ~yes if ode.rank else weakest(ode, t, end) < jnp.finfo(t.dtype).eps ** SINGULAR
+    if not callable(system.mass):
+        return End(near, singular, yes, yes)
+    (q, v), finite = end, jnp.all(jnp.isfinite(end[0]))
+    regular = lambda q: mass_is_regular(ode, q, invertible) | ~finite
+    ahead = [regular(q + AHEAD**k * (t - t0) * v) for k in (1, 2, 3)]
+    return End(near, singular, regular(q), ahead[0] & ahead[1] & ahead[2])
 
 
 def consistent_state(
@@ -168,12 +173,15 @@ def consistent_state(
     Errors: `ValueError` where no such state is found from here, naming the equations that remain off; NaN where the
     arguments are traced.
     """
+    refuse_wrong_state(system, y0)
     y0 = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
+    refuse_wrong_functions(system, t0, y0, args)
     masks = jax.tree.map(lambda x: jnp.zeros_like(x, dtype=bool), y0)
     if fixed is not None:
-        masks = jax.tree.map(lambda f, x: jnp.broadcast_to(jnp.asarray(f, bool), jnp.shape(x)), fixed, y0)
+        masks = jax.tree.map(lambda f: f.astype(bool), broadcast_to_state("fixed", fixed, y0, "booleans"))
     if rates is not None:
-        rates = jax.tree.map(lambda r, x: jnp.broadcast_to(jnp.asarray(r, x.dtype), x.shape), rates, y0)
+        rates = broadcast_to_state("rates", rates, y0, "numbers")
+        rates = jax.tree.map(lambda r, x: r.astype(x.dtype), rates, y0)
     if isinstance(system, ConstrainedSystem) and rates is None:
         found, fine, remains = _nearest_of_mechanism(system, t0, y0, args, masks)
     else:

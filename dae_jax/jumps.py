@@ -9,15 +9,22 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix
 from jax import lax
 from jaxtyping import Array, Float, Int
 
 from .checks import saved_parts
 from .initialise import consistent_state
-from .solution import RESULTS, DAESolution
+from .solution import RESULTS, DAESolution, precision_of
+from .states import NUMBERS, brief, broadcast_to_state, describe
 from .systems import System
 from .underlying import underlying_ode
+from .user_functions import refuse_other_arguments, returned
+
+
+# Entries of `stats` that do not add up over the parts of a solve.
+NO_COUNTS = ("max_steps", "end_time")
 
 
 class Jump(eqx.Module):
@@ -45,6 +52,53 @@ class Jump(eqx.Module):
     direction: bool | None = eqx.field(static=True, default=None)
     fixed: Any = None
     most: int = eqx.field(static=True, default=100)
+
+    def __check_init__(self) -> None:
+        for name in ("condition", "jump"):
+            if not callable(getattr(self, name)):
+                raise TypeError(f"`{name}` of Jump must be a function, but is {brief(getattr(self, name))}.")
+        if self.direction not in (None, True, False):
+            raise ValueError(
+                "`direction` of Jump must be True for upcrossings, False for downcrossings or None for both, but is "
+                f"{brief(self.direction)}."
+            )
+        if type(self.most) is not int or self.most < 1:
+            raise ValueError(f"`most` of Jump must be an integer of at least 1, but is {brief(self.most)}.")
+
+
+def refuse_wrong_event(event: Any, t: Any, y: Any, args: Any) -> None:
+    """Refuses functions of an event that cannot be called with (t, y, args), or do not return what they must."""
+    if event is None:
+        return
+    conditions = [event.condition] if isinstance(event, Jump) else jax.tree.leaves(event.cond_fn, is_leaf=callable)
+    for condition in conditions:
+        # A boolean that stays true is no event of which there is one.
+        _refuse_wrong_condition(condition, t, y, args, "f" if isinstance(event, Jump) else "fb")
+    if isinstance(event, Jump):
+        _refuse_wrong_jump(event, t, y, args)
+
+
+def _refuse_wrong_condition(condition: Any, t: Any, y: Any, args: Any, kinds: str) -> None:
+    refuse_other_arguments("condition(t, y, args, **kwargs)", condition, 3, terms=None, solver=None, t0=None, t1=None)
+    found = returned("condition(t, y, args, **kwargs)", condition, t, y, args)
+    fits = isinstance(found, NUMBERS) and jnp.shape(found) == ()
+    if not fits or np.dtype(jnp.result_type(found)).kind not in kinds:
+        raise ValueError(
+            "`condition(t, y, args, **kwargs)` must return a real number, whose zero is the event, but returns "
+            f"{describe(found)}."
+        )
+
+
+def _refuse_wrong_jump(event: Jump, t: Any, y: Any, args: Any) -> None:
+    found = returned("jump(t, y, args)", event.jump, t, y, args)
+    shapes = lambda tree: (jax.tree.structure(tree), [jnp.shape(x) for x in jax.tree.leaves(tree)])
+    if not isinstance(found, tuple | list) or len(found) != 2 or shapes(tuple(found)) != shapes((y, args)):
+        raise ValueError(
+            f"`jump(t, y, args)` must return (y, args), the state and the args to go on with, {describe((y, args))}, but "
+            f"returns {describe(found)}."
+        )
+    if event.fixed is not None:
+        broadcast_to_state("fixed", event.fixed, y, "booleans")
 
 
 def refuse_other_outputs(saveat: diffrax.SaveAt) -> None:
@@ -113,13 +167,13 @@ def solve_with_jumps(
         return *one(system, p.t, t1, dt0, p.y, p.args, rank), level
 
     def advance(p: _Progress) -> _Progress:
-        sol, consistent, level = part(p)
+        sol, _, level = part(p)
         end, reached = sol.ts["end"][-1], jax.tree.map(lambda y: y[-1], sol.ys["end"])
         here = (sign * wanted >= sign * p.t) & (sign * wanted <= sign * end)
         ts = jnp.where(here, wanted, p.ts)
         ys = jax.tree.map(lambda a, b: jnp.where(here.reshape(-1, *(1,) * (a.ndim - 1)), a, b), sol.ys["wanted"], p.ys)
-        stats = {k: p.stats[k] + v for k, v in sol.stats.items() if k != "max_steps"}
-        code = jnp.where(consistent, sol.result._value, RESULTS.inconsistent_start._value)
+        stats = {k: p.stats[k] + v for k, v in sol.stats.items() if k not in NO_COUNTS}
+        code = sol.result._value
         # Jumps so close that their order is round-off are no events any more.
         piled = (p.count > 0) & (sign * (end - p.t) <= 16 * resolution * (1 + jnp.abs(end)))
         jumps, exhausted = code == going, piled | (p.count >= jump.most)
@@ -135,7 +189,7 @@ def solve_with_jumps(
     unknown = jnp.zeros_like(t0)
     shape = jax.eval_shape(part, _Progress(t0, y0, args, *[None] * 6, unknown))[0]
     unsaved = jax.tree.map(lambda x: jnp.full(x.shape, jnp.inf, x.dtype), shape.ys["wanted"])
-    stats = {k: jnp.zeros((), int) for k in shape.stats if k != "max_steps"}
+    stats = {k: jnp.zeros((), int) for k in shape.stats if k not in NO_COUNTS}
     start = _Progress(
         t0, y0, args, jnp.zeros((), int), jnp.full(jump.most, jnp.inf, t0.dtype),
         jnp.full_like(wanted, jnp.inf), unsaved, stats, jnp.asarray(going, RESULTS.successful._value.dtype), unknown,
@@ -143,10 +197,12 @@ def solve_with_jumps(
     kind: Any = "checkpointed" if solve.derivative() == "reverse" else "lax"
     most = {"max_steps": jump.most + 1} if kind == "checkpointed" else {}
     p = eqxi.while_loop(lambda p: p.code == going, advance, start, kind=kind, **most)
-    stats = {"max_steps": solve.max_steps, **p.stats, "jumps": p.count, "jump_times": p.times}
+    stats = {"max_steps": solve.max_steps, **p.stats, "end_time": p.t, "jumps": p.count, "jump_times": p.times}
     result = eqx.tree_at(lambda r: r._value, RESULTS.successful, p.code)
-    sol = DAESolution(t0, t1, p.ts, p.ys, None, stats, result, None, args, rank)
-    return sol, p.code != RESULTS.inconsistent_start._value
+    precision = precision_of(t0.dtype, solve.controller)
+    sol = DAESolution(t0, t1, p.ts, p.ys, None, stats, result, None, args, rank, precision)
+    refused = (RESULTS.inconsistent_start, RESULTS.dependent_constraints, RESULTS.irregular_mass)
+    return sol, ~jnp.any(jnp.stack([p.code == code._value for code in refused]))
 
 
 def _after(system: System, jump: Jump, t: Any, y: Any, args: Any) -> tuple[Any, Any]:
@@ -163,11 +219,6 @@ def _level_at_start(
     which it came, −`before`, where its rate is not known.
     """
     value = jnp.asarray(condition(t, y, args))
-    if not jnp.issubdtype(value.dtype, jnp.floating):
-        raise TypeError(
-            f"`condition` of a Jump must return a real number that crosses zero, but returns {value.dtype}: write y[0] in "
-            "place of y[0] < 0."
-        )
     # The state as it is: one made anew from the underlying ODE is NaN where the structure allows what the numbers do not.
     z, ode = underlying_ode(system, t, y, args, rank)
     of = lambda t, z: jnp.asarray(condition(t, ode.decode(t, z), args), t.dtype)

@@ -23,13 +23,17 @@ SUMMED = 4096
 SPARSE_FROM = 5
 
 
+# How many constraints are independent: of the holonomic ones, and of all.
+Rank = tuple[int, int]
+
+
 @dataclasses.dataclass(frozen=True)
 class DenseNormals:
     """A as a matrix; `rank` where some of its rows depend on others."""
 
     holonomic: int
     nonholonomic: int
-    rank: int | None
+    rank: Rank | None
 
     def at(self, ode: Any, t: Any, q: Any, v: Any) -> tuple[Float[Array, "c n"], Float[Array, "n c"]]:
         """A and M⁻¹Aᵀ: the normals in the metric of the mass matrix."""
@@ -47,19 +51,17 @@ class DenseNormals:
     def gram_solve(self, ode: Any, normals: Any, b: Float[Array, " c"]) -> Float[Array, " c"]:
         """x with A M⁻¹Aᵀ x = b, of the first constraints where b is shorter."""
         a, n = normals[0][: b.shape[0]], normals[1][:, : b.shape[0]]
-        return semidefinite_solve(_matmul(a, n), b, self._rank_of(b.shape[0]))
+        gram = _matmul(a, n)
+        if self.rank is None:
+            return semidefinite_solve(gram, b)
+        # Which constraints depend on each other has nothing to do with their scale.
+        scale = unit_diagonal(gram)
+        rank = self.rank[b.shape[0] == self.holonomic + self.nonholonomic]
+        return scale * semidefinite_solve(gram * scale[:, None] * scale, scale * b, rank)
 
     def lengths(self, normals: Any) -> Float[Array, " c"]:
         """The length of each row of A."""
         return jnp.sqrt(jnp.sum(normals[0] ** 2, 1))
-
-    def _rank_of(self, rows: int) -> int | None:
-        """The rank of the first `rows` constraints: `rank` counts the holonomic and the nonholonomic ones together, and
-        the redundant ones are taken to be holonomic where there are any.
-        """
-        if self.rank is None or rows == self.holonomic + self.nonholonomic:
-            return self.rank
-        return max(self.rank - self.nonholonomic, 0)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -144,6 +146,12 @@ def mass_solve(mass: Float[Array, "..."] | None, x: Float[Array, "n *k"]) -> Flo
     if mass.ndim < 2:
         return x / (mass[:, None] if mass.ndim and x.ndim == 2 else mass)
     return semidefinite_solve(mass, x)
+
+
+def unit_diagonal(s: Float[Array, "c c"]) -> Float[Array, " c"]:
+    """d that makes the diagonal of diag(d) S diag(d) ±1, or leaves a 0."""
+    diagonal = jnp.abs(jnp.diagonal(s))
+    return 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
 
 
 def _matmul(a: Float[Array, "i j"], b: Float[Array, "j k"]) -> Float[Array, "i k"]:

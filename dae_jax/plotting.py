@@ -21,6 +21,12 @@ FLOOR = 1e-17
 NAMED = 40
 
 
+def _saved(times: Any, *values: Any) -> tuple[np.ndarray, ...]:
+    """Times and what belongs to them without the padding of a solve that ended early or saved its steps."""
+    kept = np.isfinite(np.asarray(times))
+    return tuple(np.asarray(x)[kept] for x in (times, *values))
+
+
 def _figure(width: float = 7.2, height: float = 4.4) -> tuple[Any, Any]:
     from matplotlib.figure import Figure
 
@@ -56,7 +62,8 @@ def drift(curves: Curves, title: str = "Drift off the constraints", unit: str = 
     What is below 1e-17 is drawn there.
     """
     figure, axes = _figure()
-    _marked(axes, {k: (np.asarray(t), np.maximum.accumulate(np.maximum(g, FLOOR))) for k, (t, g) in curves.items()})
+    kept = {label: _saved(t, g) for label, (t, g) in curves.items()}
+    _marked(axes, {label: (t, np.maximum.accumulate(np.maximum(g, FLOOR))) for label, (t, g) in kept.items()})
     axes.set(xlabel="time in s", ylabel=f"largest |g| so far{unit and ' in ' + unit}", title=title, yscale="log")
     _legend_beside(figure)
     return figure
@@ -66,7 +73,7 @@ def drift_growth(curves: Curves, title: str = "", unit: str = "", power: int = 2
     """As `drift`, with both axes logarithmic and a line that grows with a power of time to compare with."""
     figure, axes = _figure()
     for i, (label, (t, g)) in enumerate(curves.items()):
-        t, g = np.asarray(t)[1:], np.asarray(g)[1:]
+        t, g = (x[1:] for x in _saved(t, g))
         axes.loglog(t, np.maximum(g, FLOOR), color=COLOURS[i % len(COLOURS)], linewidth=1.4, label=label)
         guide = 2 * g[-1] * (t / t[-1]) ** power
         late = t > t[-1] / 30
@@ -80,9 +87,9 @@ def energy(curves: Curves, title: str = "Energy", unit: str = "J") -> Any:
     """The largest change of the energy until each time, on a log axis; `curves` maps a label to (times, energies)."""
     figure, axes = _figure()
     change = {}
-    for label, (times, values) in curves.items():
-        off = np.abs(np.asarray(values) - values[0])
-        change[label] = (np.asarray(times), np.maximum.accumulate(np.maximum(off, FLOOR)))
+    for label, curve in curves.items():
+        times, values = _saved(*curve)
+        change[label] = (times, np.maximum.accumulate(np.maximum(np.abs(values - values[0]), FLOOR)))
     _marked(axes, change)
     axes.set(xlabel="time in s", ylabel=f"largest |E − E(0)| so far in {unit}", title=title, yscale="log")
     _legend_beside(figure)
@@ -98,8 +105,8 @@ def over_time(
     """
     figure, axes = _figure()
     if exact is not None:
-        axes.plot(*curves[exact], color=GREY, alpha=0.6, linewidth=4, label=exact)
-    others = {k: xy for k, xy in curves.items() if k != exact}
+        axes.plot(*_saved(*curves[exact]), color=GREY, alpha=0.6, linewidth=4, label=exact)
+    others = {k: _saved(*xy) for k, xy in curves.items() if k != exact}
     for i, (label, (x, y)) in enumerate(others.items()):
         axes.plot(
             x, y, color=COLOURS[i % len(COLOURS)], linewidth=1.4, linestyle=("-", "--", "-.", ":")[i % 4], label=label
@@ -112,7 +119,8 @@ def over_time(
 def phase_portrait(curves: Curves, position: str, velocity: str, title: str = "Phase portrait") -> Any:
     """Velocity over position; `curves` maps a label to (positions, velocities), later ones on top."""
     figure, axes = _figure(6.4)
-    for i, (label, (x, y)) in enumerate(curves.items()):
+    for i, (label, curve) in enumerate(curves.items()):
+        x, y = _saved(*curve)
         axes.plot(x, y, color=COLOURS[i % len(COLOURS)], linewidth=1 if i == 0 else 2, label=label)
     axes.set(xlabel=position, ylabel=velocity, title=title)
     _legend_below(figure)
@@ -122,7 +130,7 @@ def phase_portrait(curves: Curves, position: str, velocity: str, title: str = "P
 def trajectory(times: np.ndarray, path: np.ndarray, first: float = 10.0, title: str = "") -> Any:
     """A path in the plane, `path` of shape (times, 2) with y pointing down: until `first` in red, then in black."""
     figure, axes = _figure(5.4, 5.4)
-    times, path = np.asarray(times), np.asarray(path)
+    times, path = _saved(times, path)
     early, late = times <= first, times >= first
     axes.plot(*path[early].T, color="#D00000", linewidth=1.3, zorder=3, label=f"0 to {min(first, times[-1]):g} s")
     if late.sum() > 1:

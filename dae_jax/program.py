@@ -14,11 +14,13 @@ import optimistix
 
 from .checks import is_saved_part, saved_parts
 from .formulations import AbstractFormulation, Residual
-from .initialise import start_is_as_expected
-from .jumps import Jump, solve_with_jumps
+from .initialise import look_at_end, look_at_start
+from .jumps import Jump, refuse_wrong_event, solve_with_jumps
 from .kernels import PullBack, inexact, one_kernel, one_kernel_enabled
 from .linalg import rms_norm
-from .solution import RESULTS, DAESolution, Interpolation, all_finite
+from .normals import Rank
+from .regularity import COARSE
+from .solution import RESULTS, DAESolution, Interpolation, all_finite, precision_of
 from .solvers import (
     BDF,
     DOP853,
@@ -35,6 +37,7 @@ from .solvers import (
 )
 from .solvers.tangent_space import TangentPoint
 from .tape import Taped, as_it_is, can_be_taped, cotangents, recorded, saved_times
+from .user_functions import refuse_wrong_functions, returned
 
 
 class Program(NamedTuple):
@@ -78,8 +81,9 @@ class _Split(eqx.Module):
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
-def _jitted(program: Program, rank: int | None, arrays: list[Any]) -> Any:
+def _jitted(program: Program, rank: int | Rank | None, arrays: list[Any]) -> Any:
     solve, *inputs = program.inputs(jax.tree.map(jnp.asarray, arrays))
+    solve.refuse_wrong_functions(*inputs)
     sol, as_expected = (
         (solve_with_jumps(solve, *inputs, rank)) if isinstance(solve.event, Jump) else solve(*inputs, rank)
     )
@@ -87,13 +91,13 @@ def _jitted(program: Program, rank: int | None, arrays: list[Any]) -> Any:
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
-def _numbers(program: Program, rank: int | None, arrays: list[Any]) -> _Split:
+def _numbers(program: Program, rank: int | Rank | None, arrays: list[Any]) -> _Split:
     """diffrax's part of a solve; jitted, so that derivatives and batches of it find it traced."""
     solve, *inputs = program.inputs(arrays)
     return _Split.of(solve._diffeqsolve(*inputs, rank))
 
 
-def run(program: Program, rank: int | None, arrays: list[Any]) -> tuple[DAESolution, Any]:
+def run(program: Program, rank: int | Rank | None, arrays: list[Any]) -> tuple[DAESolution, Any]:
     """The solution, and whether the start was consistent and of the given rank."""
     sol, as_expected = _jitted(program, rank, arrays)
     return sol.whole(), as_expected
@@ -135,24 +139,48 @@ class Solve(eqx.Module):
     progress_meter: diffrax.AbstractProgressMeter
 
     def __call__(
-        self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, rank: int | None
+        self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, rank: int | Rank | None
     ) -> tuple[DAESolution, Any]:
         numbers, arrays = self.kernel(system, t0, t1, dt0, y0, args, rank)
         out = one_kernel(numbers, self.derivative(), self._pull_back(system, t0, t1, dt0, y0, args, rank))(arrays)
-        check, check_arrays = self._check(system, t0, y0, args, rank)
+        *fields, end = out.whole()
+        check, check_arrays = self._check(system, t0, y0, args, rank, end)
         # A yes or no has no derivative.
-        consistent, as_expected = one_kernel(check, self.derivative())(jax.lax.stop_gradient(check_arrays))
-        return self._solution(out.whole(), args, rank, consistent), as_expected
+        found = one_kernel(check, self.derivative())(jax.lax.stop_gradient(check_arrays))
+        (_, as_expected), _ = found
+        return self._solution(fields, args, rank, found), as_expected
+
+    def refuse_wrong_functions(self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any) -> None:
+        """Refuses functions of the user that do not take or return what they must, in a sentence."""
+        refuse_wrong_functions(system, t0, y0, args)
+        refuse_wrong_event(self.event, t0, y0, args)
+        for part in saved_parts(self.saveat):
+            returned("saveat.fn(t, y, args)", part.fn, t0, y0, args)
 
     def _check(
-        self, system: Any, t0: Any, y0: Any, args: Any, rank: int | None
+        self, system: Any, t0: Any, y0: Any, args: Any, rank: int | Rank | None, end: Any
     ) -> tuple[Callable[..., Any], list[Any]]:
-        """Whether the start is consistent and of the given rank, as a function of arrays, and its arrays."""
-        program, arrays = split((system, t0, y0, args))
-        return lambda arrays: start_is_as_expected(*program.inputs(arrays), rank), arrays
+        """What is wrong with the start and the end, as a function of arrays, and its arrays."""
+        manifold, residual = (isinstance(self.solver, c) for c in (AbstractManifoldSolver, AbstractResidualSolver))
+        # Points between the steps of a solver of residuals are off by what its dense output is.
+        keeps = self.formulation.keeps if not residual or self.event is None else (False, False)
+        keeps = (True, True) if manifold else keeps
+        if isinstance(self.controller, diffrax.AbstractAdaptiveStepSizeController):
+            tolerances = tuple(jnp.max(jnp.asarray(getattr(self.controller, name))) for name in ("rtol", "atol"))
+        else:
+            tolerances = (0.0, 0.0) if residual else (COARSE, COARSE)
+        program, arrays = split((system, t0, y0, args, end, tolerances))
+        invertible = self.formulation.inverts_mass
+
+        def check(arrays: Any) -> Any:
+            *inputs, end, tolerances = program.inputs(arrays)
+            start = look_at_start(*inputs, rank, invertible)
+            return start, look_at_end(*inputs, rank, invertible, end, keeps, tolerances, residual)
+
+        return check, arrays
 
     def kernel(
-        self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, rank: int | None
+        self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, rank: int | Rank | None
     ) -> tuple[Callable[[list[Any]], "_Split"], list[Any]]:
         """What can become one kernel: a function of arrays, and its arrays."""
         program, arrays = split((self, system, t0, t1, dt0, y0, args))
@@ -165,7 +193,7 @@ class Solve(eqx.Module):
         return numbers, arrays
 
     def _pull_back(
-        self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, rank: int | None
+        self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, rank: int | Rank | None
     ) -> PullBack | None:
         """The reverse derivative from a tape, where it applies."""
         size = sum(leaf.size for leaf in jax.tree.leaves(y0))
@@ -194,7 +222,7 @@ class Solve(eqx.Module):
 
         return pull_back
 
-    def _taped(self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, rank: int | None) -> Taped:
+    def _taped(self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, rank: int | Rank | None) -> Taped:
         y, ode = self.formulation.encode(system, t0, y0, args, rank)
         part = self.saveat.subs
         solver = _economical(self.solver, self.between())
@@ -224,7 +252,7 @@ class Solve(eqx.Module):
             self.saveat.dense or any(part.ts is not None for part in saved_parts(self.saveat)) or self.event is not None
         )
 
-    def _diffeqsolve(self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, rank: int | None) -> Any:
+    def _diffeqsolve(self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, rank: int | Rank | None) -> Any:
         y, ode = self.formulation.encode(system, t0, y0, args, rank)
         decode = _Decode(self.formulation, self.solver)
         solver, controller = _economical(self.solver, self.between()), _fitted(self.controller, t0, t1)
@@ -235,12 +263,11 @@ class Solve(eqx.Module):
         def saved(part: Any) -> Any:
             return part if part.fn is as_it_is else eqx.tree_at(lambda s: s.fn, part, _View(part.fn, decode, args))
 
-        saveat = eqx.tree_at(
-            lambda s: s.subs,
-            self.saveat,
-            jax.tree.map(saved, self.saveat.subs, is_leaf=is_saved_part),
-            is_leaf=lambda x: x is None,
-        )
+        subs = {
+            "user": jax.tree.map(saved, self.saveat.subs, is_leaf=is_saved_part),
+            "end": diffrax.SubSaveAt(t1=True, fn=decode),
+        }
+        saveat = eqx.tree_at(lambda s: s.subs, self.saveat, subs, is_leaf=lambda x: x is None)
         event = self.event and dataclasses.replace(
             self.event,
             cond_fn=jax.tree.map(lambda c: _on_states(c, decode, args), self.event.cond_fn, is_leaf=callable),
@@ -257,12 +284,18 @@ class Solve(eqx.Module):
         interpolation = None
         if sol.interpolation is not None:
             interpolation = Interpolation(_uniform(self.solver, sol.interpolation), decode, ode)
-        stats = {**sol.stats, "switches": cast(Any, sol.solver_state).switches} if selects else sol.stats
-        return sol.t0, sol.t1, sol.ts, sol.ys, interpolation, stats, sol.result, sol.event_mask
+        ts, ys = cast(Any, sol.ts), cast(Any, sol.ys)
+        end = jax.lax.stop_gradient(jax.tree.map(lambda x: x[-1], (ts["end"], ys["end"])))
+        stats = {**sol.stats, "end_time": end[0]}
+        starts = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(y)]))
+        result = RESULTS.where(starts, RESULTS.promote(sol.result), RESULTS.no_finite_start)
+        if selects:
+            stats["switches"] = cast(Any, sol.solver_state).switches
+        return sol.t0, sol.t1, ts["user"], ys["user"], interpolation, stats, result, sol.event_mask, end
 
-    def _solution(self, out: Any, args: Any, rank: int | None, consistent: Any) -> DAESolution:
-        *fields, result, event_mask = out
-        code = RESULTS.promote(result)
+    def _solution(self, out: Any, args: Any, rank: int | Rank | None, found: Any) -> DAESolution:
+        *fields, code, event_mask = out
+        (start, _), end = found
         _, _, ts, ys, *_ = fields
         failed = lambda name, instead, when=True: RESULTS.where((code == name) & when, instead, code)
         if isinstance(self.formulation, Residual):
@@ -274,8 +307,16 @@ class Solve(eqx.Module):
         if ts is not None:
             finite = [all_finite(*pair) for pair in _saved(self.saveat, ts, ys)]
             code = failed(RESULTS.successful, RESULTS.not_finite, ~jnp.all(jnp.stack(finite))) if finite else code
-        code = RESULTS.where(consistent, code, RESULTS.inconsistent_start)
-        return DAESolution(*fields, code, event_mask, args, rank)
+        precision = precision_of(fields[0].dtype, self.controller)
+        went_well = (code == RESULTS.successful) | (code == RESULTS.event_occurred)
+        stuck = [RESULTS.step_rejected, RESULTS.off_manifold, RESULTS.no_convergence, RESULTS.error_too_large]
+        stuck = jnp.any(jnp.stack([code == name for name in (*stuck, RESULTS.singular_iteration_matrix)]))
+        code = RESULTS.where(stuck & end.singular, RESULTS.singular_configuration, code)
+        code = RESULTS.where(went_well & ~end.near, RESULTS.off_constraints, code)
+        code = RESULTS.where(end.masses & (end.masses_ahead | went_well), code, RESULTS.irregular_mass)
+        for wrong, name in enumerate(("inconsistent_start", "dependent_constraints", "irregular_mass"), 1):
+            code = RESULTS.where(start == wrong, getattr(RESULTS, name), code)
+        return DAESolution(*fields, code, event_mask, args, rank[1] if isinstance(rank, tuple) else rank, precision)
 
 
 def _saved(saveat: Any, ts: Any, ys: Any) -> list[tuple[Any, Any]]:

@@ -9,20 +9,19 @@ from jaxtyping import Array, Bool, Float
 
 from .diagnostics import drift, energy
 from .initialise import consistent_state
-from .solution import DAESolution
+from .solution import RESULTS, DAESolution
 from .solve import daesolve
-from .systems import ConstrainedSystem
+from .systems import ConstrainedSystem, System
 
 
 def final_state(sol: DAESolution) -> Any:
-    """The last saved state."""
-    return jax.tree.map(lambda y: y[-1], sol.ys)
+    """The last saved state; also `sol.final`."""
+    return sol.final
 
 
-def largest_drift(system: ConstrainedSystem, sol: DAESolution) -> Float[Array, ""]:
-    """max |(g, ġ, h)| over the saved times."""
-    position, velocity = drift(system, sol)
-    return jnp.maximum(jnp.max(position), jnp.max(velocity))
+def largest_drift(system: System, sol: DAESolution) -> Float[Array, ""]:
+    """The largest of the levels of `drift` over the saved times, max |(g, ġ, h)| of a mechanism."""
+    return jnp.max(jnp.stack(drift(system, sol).levels))
 
 
 def energy_error(system: ConstrainedSystem, sol: DAESolution) -> Float[Array, ""]:
@@ -32,9 +31,15 @@ def energy_error(system: ConstrainedSystem, sol: DAESolution) -> Float[Array, ""
 
 
 def largest_error(sol: DAESolution, reference: Any) -> Float[Array, ""]:
-    """max |y − reference| over the saved times; `reference` has the structure of `sol.ys`."""
-    differences = jax.tree.map(lambda y, r: jnp.max(jnp.abs(y - r)), sol.ys, reference)
-    return jnp.max(jnp.stack(jax.tree.leaves(differences)))
+    """max |y − reference| over the saved times, infinite where the solve failed; `reference` has the structure of `sol.ys`."""
+
+    def largest(y: Any, r: Any) -> Any:
+        saved = jnp.isfinite(sol.ts).reshape(-1, *(1,) * (y.ndim - 1))
+        return jnp.max(jnp.where(saved, jnp.abs(y - r), 0))
+
+    error = jnp.max(jnp.stack(jax.tree.leaves(jax.tree.map(largest, sol.ys, reference))))
+    went_well = (sol.result == RESULTS.successful) | (sol.result == RESULTS.event_occurred)
+    return jnp.where(went_well, error, jnp.inf)
 
 
 def first_time(ts: Float[Array, " times"], happened: Bool[Array, " times"]) -> Float[Array, ""]:

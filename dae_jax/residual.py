@@ -1,5 +1,6 @@
 """Any system as 0 = F(t, y, ẏ) on flat vectors: what structural analysis and the solvers of residuals see."""
 
+import dataclasses
 from typing import Any, Literal
 
 import equinox as eqx
@@ -9,10 +10,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .constraints import MechanicalODE, at_one_instant
+from .linalg import row_products, solve
 from .structure.layout import Layout
 from .systems import ConstrainedSystem, ImplicitDAE, SemiExplicitDAE, System
 
 
+# Up to this many unknowns multipliers are found without M⁻¹, where coordinates may be massless.
+BORDERED = 200
 Form = Literal["index-3", "index-2", "GGL"]
 
 
@@ -23,7 +27,8 @@ class ResidualForm(eqx.Module):
         index-2:  0 = q̇ − v,            0 = M v̇ − f + Aᵀλ,   0 = (G v + g_t, h);
         GGL:      0 = M (q̇ − v) + Gᵀη,  0 = M v̇ − f + Aᵀλ,   0 = (G v + g_t, h),   0 = g,
 
-    for a `SemiExplicitDAE` y = (x, z) and F = (ẋ − f, g).
+    for a `SemiExplicitDAE` y = (x, z) and F = (ẋ − f, g). The multipliers in y are those of the equations divided by `units`,
+    so that a multiplier has the size of the acceleration, and η of the velocity, that it brings about.
 
     Source of GGL: C. W. Gear, B. Leimkuhler, G. K. Gupta, J. Comput. Appl. Math. 12–13 (1985), 77–90.
     """
@@ -34,6 +39,7 @@ class ResidualForm(eqx.Module):
     layout: Layout = eqx.field(static=True)
     extra: int = eqx.field(static=True)
     equations: tuple[str, ...] = eqx.field(static=True)
+    units: Float[Array, " extra"] | None = None
 
     @classmethod
     def of(cls, system: System, t: Any, state: Any, args: Any, form: Form = "index-3") -> "ResidualForm":
@@ -59,7 +65,7 @@ class ResidualForm(eqx.Module):
             equations = _names("residual", out)
         if len(equations) != layout.size:
             raise ValueError(
-                f"A {type(system).__name__} must have as many equations as unknowns, but has {len(equations)} equations "
+                f"{type(system).__name__} must have as many equations as unknowns, but has {len(equations)} equations "
                 f"for {layout.size} unknowns."
             )
         return cls(system, args, form, layout, 0, equations)
@@ -88,6 +94,28 @@ class ResidualForm(eqx.Module):
         names = [letters[int(n[1])] + n[3:] for n in self.layout.names()]
         multipliers = [f"multiplier[{i}]" for i in range(self.extra)]
         return (*names, *multipliers)
+
+    def at_start(self, t: Any, state: Any) -> tuple["ResidualForm", Float[Array, " n"]]:
+        """The form in units of a mechanism's own, and the flat vector of a state with its multipliers.
+
+        The unit of a multiplier is the mass in the direction of its constraint, aᵀ M a / aᵀ a, over the length of a: then
+        neither the unit of mass nor a factor of the constraint makes a difference.
+        """
+        if not isinstance(self.system, ConstrainedSystem):
+            return self, self.encode(state)
+        ode = MechanicalODE.of(self.system, t, state, self.args)
+        flat = ode.encode(state)
+        a, mass = ode.constraint_jacobian(t, *flat), ode.mass(flat[0])
+        squares = jnp.sum(a * a, 1)
+        squares = jnp.where(squares > 0, squares, 1)
+        masses = jnp.ones_like(squares) if mass is None else jnp.sum(a * _weighted(mass, a.T).T, 1) / squares
+        # Where all that a constraint ties together is massless, that of the others has to do.
+        masses = jnp.where(masses > 0, masses, jnp.max(masses))
+        units = jax.lax.stop_gradient(jnp.where(masses > 0, masses, 1) / jnp.sqrt(squares))
+        multipliers = _multipliers(ode, t, flat, a, mass, units)
+        form = dataclasses.replace(self, units=jnp.concatenate([units, units])[: self.extra])
+        rest = jnp.zeros(self.extra - multipliers.size, a.dtype)
+        return form, jnp.concatenate([self.layout.flatten(state), multipliers, rest])
 
     def encode(self, state: Any) -> Float[Array, " n"]:
         """The flat vector of a state, multipliers 0."""
@@ -119,18 +147,40 @@ class ResidualForm(eqx.Module):
         assert isinstance(self.system, ConstrainedSystem)
         ode = MechanicalODE.of(self.system, t, self.layout.unflatten(y[: self.layout.size]), self.args)
         n, m, p = ode.layout.size, ode.holonomic, ode.nonholonomic
-        q, v, multipliers = y[:n], y[n : 2 * n], y[2 * n : 2 * n + m + p]
+        q, v = y[:n], y[n : 2 * n]
+        multipliers, eta = jnp.split(y[2 * n :] if self.units is None else y[2 * n :] * self.units, [m + p])
         a, mass = ode.constraint_jacobian(t, q, v), ode.mass(q)
-        weighted = lambda x: x if mass is None else mass * x if mass.ndim < 2 else jnp.sum(mass * x, 1)
-        momentum = weighted(yd[n : 2 * n]) - ode.force(t, q, v) + jnp.sum(multipliers[:, None] * a, 0)
+        momentum = _weighted(mass, yd[n : 2 * n]) - ode.force(t, q, v) + jnp.sum(multipliers[:, None] * a, 0)
         velocity = ode.velocity_constraint(t, q, v)
         kinematics = yd[:n] - v
         if self.form == "index-3":
             return jnp.concatenate([kinematics, momentum, ode.constraint(t, q), velocity[m:]])
         if self.form == "index-2":
             return jnp.concatenate([kinematics, momentum, velocity])
-        stabilised = weighted(kinematics) + jnp.sum(y[2 * n + m + p :, None] * a[:m], 0)
+        stabilised = _weighted(mass, kinematics) + jnp.sum(eta[:, None] * a[:m], 0)
         return jnp.concatenate([stabilised, momentum, velocity, ode.constraint(t, q)])
+
+
+def _weighted(mass: Float[Array, "..."] | None, x: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
+    """M x."""
+    if mass is None:
+        return x
+    if mass.ndim < 2:
+        return mass * x if x.ndim < 2 else (mass * x.T).T
+    return jnp.sum(mass * x, 1) if x.ndim < 2 else row_products(mass, x.T)
+
+
+def _multipliers(ode: MechanicalODE, t: Any, y: Any, a: Any, mass: Any, units: Any) -> Float[Array, " c"]:
+    """λ at a state, in its `units`, from M v̇ + Aᵀλ = f and A v̇ = −γ: M may be singular."""
+    n, c = ode.layout.size, len(a)
+    if mass is None or n + c > BORDERED:
+        return ode.multipliers(t, y) / units
+    momentum = jnp.concatenate([_weighted(mass, jnp.eye(n, dtype=a.dtype)), a.T * units], 1)
+    matrix = jnp.concatenate([momentum, jnp.concatenate([a, jnp.zeros((c, c), a.dtype)], 1)])
+    right = jnp.concatenate([ode.force(t, *y), -ode.bias(t, *y)])
+    largest = jnp.max(jnp.abs(matrix), 1)
+    scale = 1 / jnp.where(largest > 0, largest, 1)
+    return solve(matrix * scale[:, None], right * scale)[n:]
 
 
 def _names(stem: str, out: Any) -> tuple[str, ...]:

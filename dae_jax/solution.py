@@ -7,6 +7,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Real
 
 
@@ -14,18 +15,41 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     """diffrax's result codes, and those of a DAE."""
 
     inconsistent_start = (
-        "The initial state `y0` violates the constraints (position or velocity level). "
+        "The initial state `y0` violates the equations or the hidden constraints (of a mechanism: at position or velocity level). "
         "`dae_jax.consistent_state(system, t0, y0, args)` gives the nearest state that does not."
     )
+    dependent_constraints = (
+        "The constraints depend on each other at the start, or not as many are independent as `rank` says: a gradient "
+        "vanishes (write the constraint itself, not its square), the start is a singular configuration, or constraints are "
+        "redundant. Where these agree say how many are independent by `ConstrainedSystem(..., rank=...)`: with a start that "
+        "is traced (`jit`, `vmap`) it is not found."
+    )
+    irregular_mass = (
+        "The mass matrix is not symmetric and positive definite, at the start or where the solve ended. A massless "
+        "coordinate is for RadauIIA5() or BDF() with GGL() or Residual(...), and for DummyDerivatives()."
+    )
+    singular_configuration = (
+        "The constraints become dependent where the solve ended: a singular configuration, such as a dead centre or a "
+        "linkage at the end of its reach, beyond which the motion does not exist or is not determined. Stop before it "
+        "(`event`), or change what drives it there."
+    )
+    off_constraints = (
+        "The solution does not satisfy the constraints at its end: it has drifted off by as much as its own size, "
+        "constraints that were redundant contradict each other, or one has become singular. Use a method that keeps the "
+        "constraints, such as OrthogonalProjection, and smaller steps or tolerances; `dae_jax.drift` shows where."
+    )
+    no_finite_start = (
+        "The formulation has no finite starting point: the chart of `StateSpace` does not give the initial positions (it must "
+        "satisfy the constraints for every z; near a fold give `guess`), or a function is not finite at the start."
+    )
     not_finite = (
-        "The solution is not finite: the force or a constraint returned NaN or infinity, the constraints became "
-        "dependent (say how many are independent by `ConstrainedSystem(..., rank=...)`), or the steps are too large for "
-        "the method."
+        "The solution is not finite: the force, the mass matrix or a constraint returned NaN or infinity, a mass became "
+        "negative, the constraints became dependent, or the steps are too large for the method."
     )
     step_rejected = (
         "The step size went to the resolution of time: at the last time reached the force is not finite, the "
-        "constraints become dependent (a singular configuration) or jump, or the equations do not determine all "
-        "derivatives (`dae_jax.analyse` says so)."
+        "constraints become dependent (a singular configuration), contradict each other or jump, or the equations do not "
+        "determine all derivatives (`dae_jax.analyse` says so)."
     )
     off_manifold = (
         "The nonlinear equations of a step had no solution within reach: the step is too large for the manifold's "
@@ -51,6 +75,10 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
 
 
+# A success says so where it is printed.
+RESULTS._index_to_message[int(RESULTS.successful._value)] = "successful"
+
+
 class Interpolation(eqx.Module):
     """The solution at any time, in the user's structure, on the manifold where the method keeps its steps there."""
 
@@ -71,10 +99,11 @@ class DAESolution(eqx.Module):
     - `t0`, `t1`: the interval.
     - `ts`: the saved times; `ys`: the saved states, with the structure of `y0` (or of what `SaveAt(fn=...)` returns).
     - `interpolation`: with `SaveAt(dense=True)`, the solution at any time; `sol.evaluate(t)` for short.
-    - `stats`: counts of steps.
+    - `stats`: counts of steps; `stats["end_time"]`: the time at which the solve ended.
     - `result`: a `RESULTS` code, with its message.
     - `event_mask`: which event ended the solve, if any.
     - `rank`: how many constraints are independent, where some are redundant, else `None`.
+    - `precision`: with how many digits it was computed, and the tolerances: "float32, rtol 1e-05, atol 1e-05".
     """
 
     t0: Any
@@ -87,12 +116,48 @@ class DAESolution(eqx.Module):
     event_mask: Any
     args: Any = None
     rank: int | None = eqx.field(static=True, default=None)
+    precision: str = eqx.field(static=True, default="")
+
+    @property
+    def final(self) -> Any:
+        """The last saved state, to go on from with `y0=sol.final`; of each part of `SaveAt(subs=...)` where there are any.
+        Infinite where nothing was saved. Of a batch of solutions, the last state of each.
+
+        Errors: `ValueError` where the solve was to save nothing.
+        """
+        if self.ts is None:
+            raise ValueError("The solution has no saved states; pass `saveat=diffrax.SaveAt(t1=True)`.")
+        return jax.tree.map(_last, self.ts, self.ys)
 
     def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Any:
         """The state at any time, where `SaveAt(dense=True)` was asked for."""
         if self.interpolation is None:
             raise ValueError("The solution has no dense output; pass `saveat=diffrax.SaveAt(dense=True)`.")
         return self.interpolation.evaluate(t0, t1, left)
+
+
+def precision_of(dtype: Any, controller: Any) -> str:
+    """With how many digits a solve computes and what it allows for an error, in words."""
+    if not isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
+        return f"{np.dtype(dtype)}, fixed steps"
+    given = {name: getattr(controller, name, None) for name in ("rtol", "atol")}
+    said = [f"{name} {value:g}" for name, value in given.items() if isinstance(value, float | int)]
+    return ", ".join([str(np.dtype(dtype)), *said])
+
+
+def _last(ts: Any, ys: Any) -> Any:
+    if ts.ndim > 1:
+        return jax.vmap(_last)(ts, ys)
+    return jax.tree.map(lambda y: y[-1], without_padding(ts, ys)[1])
+
+
+def without_padding(ts: Any, ys: Any) -> tuple[Any, Any]:
+    """Saved times and states with padding, times that are infinite, overwritten by the last ones that were saved: every
+    function of them then has its value there, and its largest and smallest are those over the saved times.
+    """
+    last = jnp.maximum(jnp.sum(jnp.isfinite(ts)) - 1, 0)
+    at = jnp.minimum(jnp.arange(ts.shape[0]), last)
+    return ts[at], jax.tree.map(lambda y: y[at], ys)
 
 
 def all_finite(ts: Any, ys: Any) -> Any:

@@ -8,15 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .checks import (
-    as_array,
-    checked,
-    refuse_bad_start,
-    refuse_bad_times,
-    refuse_misfits,
-    refuse_no_event,
-    takes_residuals,
-)
+from .checks import as_array, checked, refuse_bad_start, refuse_bad_times
+from .failures import OKAY, in_words, raised_in_the_program
 from .formulations import (
     AbstractFormulation,
     Differentiation,
@@ -26,13 +19,16 @@ from .formulations import (
     why_not_as_written,
 )
 from .jumps import Jump, refuse_other_outputs
+from .normals import Rank
 from .program import Program, Solve, run, split
-from .solution import RESULTS, DAESolution
+from .solution import DAESolution
+from .solve_options import refuse_misfits, refuse_no_event, refuse_other_steps, refuse_wrong_options, takes_residuals
 from .solvers import SelectedResiduals, SelectedStates
 from .systems import System
+from .user_functions import not_finite, refuse_wrong_functions
 
 
-_ranks: dict[Program, int | None] = {}
+_ranks: dict[Program, Rank | None] = {}
 
 
 def daesolve(
@@ -86,7 +82,7 @@ def daesolve(
         sol, _ = run(program, getattr(system, "rank", None), arrays)
     else:
         sol = _run_on_numbers(program, arrays, inputs)
-    return _raise_if_failed(sol) if throw else sol
+    return _raise_if_failed(sol, inputs) if throw else sol
 
 
 def prepared(
@@ -95,11 +91,13 @@ def prepared(
 ) -> tuple[Solve, Any, Any, Any, Any, Any, Any]:  # fmt: skip
     """The method and (system, t0, t1, dt0, y0, args) of a solve, checked, with the defaults filled in."""
     y0, args = checked(system, t0, t1, dt0, y0, args)
+    refuse_wrong_options(saveat, stepsize_controller, adjoint, event, max_steps, progress_meter)
     if formulation is None and takes_residuals(solver):
         formulation = _for_residuals(system, t0, y0, args)
     elif formulation is None:
         formulation = Differentiation()
     refuse_misfits(system, formulation, solver, t0, y0, args)
+    refuse_other_steps(solver, stepsize_controller, dt0)
     if isinstance(formulation, Residual) and formulation.variable_index is None:
         why_not = _why_not_as_written(system, t0, y0, args, formulation, solver.highest_index)
         if why_not:
@@ -114,7 +112,7 @@ def prepared(
         solver = SelectedStates(solver)
     dtype = jnp.result_type(*jax.tree.leaves(y0))
     if stepsize_controller is None:
-        stepsize_controller = _default_controller(solver, dt0, dtype)
+        stepsize_controller = _default_controller(dt0, dtype)
     t0, t1, dt0 = (x if x is None else as_array(x, dtype) for x in (t0, t1, dt0))
     saveat = jax.tree.map(lambda x: as_array(x, dtype) if isinstance(x, np.ndarray | jax.Array) else x, saveat)
     if event is not None:
@@ -141,7 +139,9 @@ def _found_of_structure(program: Program, shapes: tuple[Any, ...], form: Any, hi
     found = []
 
     def look(arrays: Any) -> None:
-        found.append(why_not_as_written(*program.inputs(arrays), form, highest))
+        inputs = program.inputs(arrays)
+        refuse_wrong_functions(*inputs)
+        found.append(why_not_as_written(*inputs, form, highest))
 
     jax.eval_shape(look, list(shapes))
     return found[0]
@@ -153,36 +153,30 @@ def _run_on_numbers(program: Program, arrays: list[Any], inputs: Any) -> DAESolu
     """
     solve, system, t0, t1, _, y0, args = inputs
     refuse_bad_times(solve.saveat, t0, t1)
-    sol, as_expected = run(program, _ranks.get(program, getattr(system, "rank", None)), arrays)
+    rank = _ranks.get(program, getattr(system, "rank", None))
+    sol, as_expected = run(program, rank, arrays)
     # Inside an outer `jit` the result is no number, although the inputs are: they are looked at each time it is traced.
     if isinstance(as_expected, jax.core.Tracer) or not as_expected:
         with jax.ensure_compile_time_eval():
-            _ranks[program] = refuse_bad_start(system, t0, y0, args)
-        sol, _ = run(program, _ranks[program], arrays)
+            _ranks[program] = refuse_bad_start(system, t0, y0, args, solve.formulation.inverts_mass)
+        if _ranks[program] != rank:
+            sol, _ = run(program, _ranks[program], arrays)
     return sol
 
 
-def _default_controller(solver: Any, dt0: Any, dtype: Any) -> Any:
+def _default_controller(dt0: Any, dtype: Any) -> Any:
     if dt0 is not None:
         return diffrax.ConstantStepSize()
-    if not isinstance(solver, diffrax.AbstractAdaptiveSolver):
-        raise ValueError(f"`dt0` must be given: {type(solver).__name__} takes fixed steps.")
     return _PID64 if dtype == jnp.float64 else _PID32
 
 
 _PID64, _PID32 = (diffrax.PIDController(rtol=tolerance, atol=tolerance) for tolerance in (1e-8, 1e-5))
 
 
-_OKAY = {int(code._value) for code in (RESULTS.successful, RESULTS.event_occurred)}
-
-
-def _raise_if_failed(sol: DAESolution) -> DAESolution:
+def _raise_if_failed(sol: DAESolution, inputs: Any) -> DAESolution:
     if isinstance(sol.result._value, jax.core.Tracer):
-        okay = (sol.result == RESULTS.successful) | (sol.result == RESULTS.event_occurred)
-        return sol.result.error_if(sol, ~okay)
-    if int(sol.result._value) in _OKAY:
+        return raised_in_the_program(sol)
+    if int(sol.result._value) in OKAY:
         return sol
-    reached = [np.asarray(t)[np.isfinite(t)] for t in jax.tree.leaves(sol.ts)]
-    last = [t[-1] for t in reached if t.size]
-    where = f" (last saved time: t = {last[-1]:.6g})" if last else ""
-    raise RuntimeError(f"{RESULTS[sol.result]}{where} {sol.stats['num_steps']} steps were taken.")
+    _, system, t0, _, _, y0, args = inputs
+    raise RuntimeError(" ".join([str(in_words(sol)), not_finite(system, t0, y0, args)]).strip())

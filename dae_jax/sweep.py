@@ -17,8 +17,10 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import PyTree
 
+from .failures import sentence_of
 from .progress import Progress
 from .solution import RESULTS
+from .states import brief
 from .sweep_store import Memory, Store
 
 
@@ -93,6 +95,8 @@ def sweep(
     Errors: `ValueError` for inputs without a common leading axis, and for a store of another sweep; `OSError` before the
     work starts where the store cannot be written or there is no room for it.
     """
+    if not callable(fn):
+        raise TypeError(f"`fn` must be a function of one element, but is {brief(fn)}.")
     elements = inputs.elements() if isinstance(inputs, Grid) else jax.tree.map(np.asarray, inputs)
     size = _leading(elements)
     devices = list(devices or jax.local_devices())
@@ -177,12 +181,25 @@ def _run(call: Any, elements: Any, chunk: int, kept: Any, devices: list[Any], re
                     return
                 finished, waiting = wait(waiting, return_when=FIRST_COMPLETED)
                 for future in finished:
-                    c, rows = future.result()
+                    c, rows = _result(future)
                     kept.put(c, c * chunk, rows)
                 report()
         finally:
             for future in waiting:
                 future.cancel()
+
+
+def _result(future: Future[Any]) -> Any:
+    try:
+        return future.result()
+    except jax.errors.JaxRuntimeError as error:
+        sentence = sentence_of(error)
+        if sentence is None:
+            raise
+        raise RuntimeError(
+            f"{sentence}\nIn a sweep call `daesolve(..., throw=False)` and return `sol.result`: an element that fails does not "
+            "stop the others then."
+        ) from None
 
 
 def _count_failures(structure: Any) -> Callable[[list[np.ndarray]], int]:

@@ -33,8 +33,9 @@ class ConstrainedSystem(eqx.Module):
       positive definite matrix, or a function `(q, args) → (n, n)` matrix.
     - `nonholonomic(t, q, v, args)`: h, constraints at velocity level (rolling, knife edge).
     - `potential(q, args)`: the potential energy; used by `energy` alone.
-    - `rank`: how many of the m + p constraints are independent, where some are redundant. `daesolve` finds it at the
-      initial state where that is concrete; say it here where the initial state is traced (`jit`, `vmap`).
+    - `rank`: how many of the m + p constraints are independent, where some are redundant, or a pair, how many of the m
+      and how many of all; a number takes the redundant ones to be holonomic. `daesolve` finds it at the initial state
+      where that is concrete; say it here where the initial state is traced (`jit`, `vmap`).
 
     Source: E. Hairer, G. Wanner, *Solving Ordinary Differential Equations II*, eq. VII.1.46.
     """
@@ -44,7 +45,7 @@ class ConstrainedSystem(eqx.Module):
     mass: Any = None
     nonholonomic: Callable[..., Any] | None = None
     potential: Callable[..., Any] | None = None
-    rank: int | None = eqx.field(static=True, default=None)
+    rank: int | tuple[int, int] | None = eqx.field(static=True, default=None)
 
     def __check_init__(self) -> None:
         optional = ("constraint", "nonholonomic", "potential")
@@ -53,6 +54,12 @@ class ConstrainedSystem(eqx.Module):
             raise TypeError(
                 "A ConstrainedSystem needs a `constraint` or a `nonholonomic` constraint; "
                 "without either it is an ODE, which `diffrax.diffeqsolve` solves."
+            )
+        counts = self.rank if isinstance(self.rank, tuple) else (self.rank,)
+        if self.rank is not None and not (len(counts) < 3 and all(type(k) is int and k >= 0 for k in counts)):
+            raise ValueError(
+                "`rank` must be how many of the constraints are independent, an integer (or a pair, of the holonomic ones and "
+                f"of all), or None for all of them, but is {self.rank!r}."
             )
 
     def mass_matrix(self, q: Any, args: Any = None) -> Float[Array, "n n"] | Float[Array, " n"] | None:

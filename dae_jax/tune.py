@@ -11,6 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from .progress import Progress
+from .states import NUMBERS, brief
 
 
 if TYPE_CHECKING:  # half of the time that importing the library takes beyond diffrax
@@ -99,6 +100,8 @@ def tune(
 
     Errors: `ValueError` for parameters that are not positive, and where the loss is finite nowhere.
     """
+    if not callable(loss):
+        raise TypeError(f"`loss` must be a function of the parameters, but is {brief(loss)}.")
     logs, unravel = ravel_pytree(jax.tree.map(_checked_log, params))
     if steps < 1 or starts < 1:
         raise ValueError(f"`steps` and `starts` must be at least 1, but are {steps} and {starts}.")
@@ -133,7 +136,7 @@ def tune(
 
 
 def _checked_log(p: Any) -> Any:
-    if not np.all(np.asarray(p) > 0) or not np.all(np.isfinite(np.asarray(p))):
+    if not isinstance(p, NUMBERS) or not np.all(np.asarray(p) > 0) or not np.all(np.isfinite(np.asarray(p))):
         raise ValueError(f"`params` must be positive and finite, but hold {p}.")
     return jnp.log(jnp.asarray(p, jnp.result_type(float, p)))
 

@@ -175,7 +175,7 @@ class StructuralODE(ManifoldODE):
         """The matrix and the right-hand side of the equations for X."""
         zero = jnp.zeros(self.form.size, y.dtype)
         right = -self.of_highest_order(t, y, zero)
-        if feedback is not None:
+        if feedback is not None and any(self.orders.equations):
             levels = self.levels(t, y, zero, max(self.orders.equations, default=0))
             terms = [
                 feedback(*(levels[k][i] for k in range(c))) if c else 0 for i, c in enumerate(self.orders.equations)

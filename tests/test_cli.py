@@ -73,7 +73,7 @@ def test_analyse_prints_and_draws_a_system_of_a_module(tmp_path, monkeypatch, ca
     )
     monkeypatch.chdir(tmp_path)
     assert main(["analyse", "mine:integrator", "--out", "incidence.png"]) == 0
-    assert "1 equations, index 0, 1 degrees of freedom" in capsys.readouterr().out
+    assert "1 equation, index 0, 1 initial value to choose" in capsys.readouterr().out
     assert (tmp_path / "incidence.png").stat().st_size > 10_000
     for unwritable in ("incidence.xyz", "no-such-folder/incidence.png"):
         with pytest.raises(SystemExit) as end:

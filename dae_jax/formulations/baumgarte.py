@@ -1,8 +1,11 @@
 """Baumgarte's stabilisation (Pöll, Hafner and Heinzl, sec. 2.2)."""
 
+import math
 from typing import Any
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ..constraints import ManifoldODE
@@ -23,6 +26,8 @@ class Baumgarte(AbstractFormulation):
 
     - `alpha`, `beta`: α and β, in 1/s; arrays may be batched over and differentiated.
 
+    Errors: `ValueError` for a negative α, with which errors grow.
+
     Source: J. Baumgarte, Comput. Methods Appl. Mech. Eng. 1 (1972), 1–16.
     """
 
@@ -30,6 +35,16 @@ class Baumgarte(AbstractFormulation):
     beta: Float[ArrayLike, ""]
 
     def __init__(self, alpha: Float[ArrayLike, ""], beta: Float[ArrayLike, ""]) -> None:
+        for name, value in (("alpha", alpha), ("beta", beta)):
+            if not isinstance(value, jax.Array | np.ndarray | np.generic | float | int) or isinstance(value, bool):
+                raise TypeError(f"`{name}` of Baumgarte must be a number in 1/s, but is {value!r}.")
+            if isinstance(value, float) and not math.isfinite(value):
+                raise ValueError(f"`{name}` of Baumgarte must be finite, but is {value}.")
+        if not isinstance(alpha, jax.core.Tracer) and np.any(np.asarray(alpha) < 0):
+            raise ValueError(
+                f"`alpha` of Baumgarte must not be negative, but is {alpha}: s² + 2αs + β² has a root with a positive real "
+                "part then, and an error of the constraint grows without bound."
+            )
         # Arrays, so that another value is not another compilation.
         self.alpha = jnp.asarray(alpha, jnp.result_type(float, alpha))
         self.beta = jnp.asarray(beta, jnp.result_type(float, beta))

@@ -1,7 +1,7 @@
 """Index reduction by differentiation and substitution (Pöll, Hafner and Heinzl, sec. 2.1)."""
 
 import abc
-from typing import Any
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
@@ -18,7 +18,16 @@ class AbstractFormulation(eqx.Module):
         y0, ode = formulation.encode(system, t0, state, args)
         sol = diffrax.diffeqsolve(formulation.term(), solver, t0, t1, dt0, y0, args=ode)
         state = formulation.decode(t, y, ode)
+
+    `inverts_mass`: whether M⁻¹ is needed, so that no coordinate can be massless; `keeps`: whether g and (ġ, h) hold
+    whatever the solver does.
     """
+
+    inverts_mass: ClassVar[bool] = True
+
+    @property
+    def keeps(self) -> tuple[bool, bool]:
+        return False, False
 
     @abc.abstractmethod
     def encode(

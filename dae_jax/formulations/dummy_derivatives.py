@@ -1,6 +1,6 @@
 """Index reduction by Pantelides' algorithm and dummy derivatives (Pöll, Hafner and Heinzl, sec. 2.3)."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -28,6 +28,12 @@ class DummyDerivatives(Differentiation):
     Comput. 14 (1993), 677–692; the choice at run time: S. E. Mattsson, H. Olsson, H. Elmqvist, *Dynamic selection of states
     in Dymola*, Modelica Workshop 2000.
     """
+
+    inverts_mass: ClassVar[bool] = False
+
+    @property
+    def keeps(self) -> tuple[bool, bool]:
+        return True, True
 
     def encode(self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None) -> Any:
         form = ResidualForm.of(system, t, state, args)

@@ -1,14 +1,12 @@
 """The equations as they are written, 0 = F(t, y, ẏ), for solvers that take them so."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..constraints import MechanicalODE
 from ..pencil import Pencil
 from ..residual import Form, ResidualForm
-from ..systems import ConstrainedSystem
 from .differentiation import AbstractFormulation
 
 
@@ -24,6 +22,8 @@ class Residual(AbstractFormulation):
       equations are taken as they are also where a solver need not converge for them.
     """
 
+    inverts_mass: ClassVar[bool] = False
+
     form: Form = eqx.field(static=True, default="GGL")
     variable_index: tuple[int, ...] | None = eqx.field(static=True, default=None)
 
@@ -31,24 +31,24 @@ class Residual(AbstractFormulation):
         if self.form not in ("index-3", "index-2", "GGL"):
             raise ValueError(f'`form` must be "index-3", "index-2" or "GGL", but is {self.form!r}.')
 
+    @property
+    def keeps(self) -> tuple[bool, bool]:
+        return self.form != "index-2", self.form != "index-3"
+
     def encode(self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None) -> tuple[Any, Pencil]:
         form = ResidualForm.of(system, t, state, args, self.form)
-        y = form.encode(state)
         if self.variable_index is not None and len(self.variable_index) != form.size:
             raise ValueError(
                 f"`variable_index` must have a number for each of {', '.join(form.variables)}: {form.size} in all, but has "
                 f"{len(self.variable_index)}."
             )
-        if isinstance(system, ConstrainedSystem):
-            if rank is not None:
-                raise ValueError(
-                    "Some constraints are redundant, which leaves their multipliers undetermined: a residual needs "
-                    "independent ones. Remove the redundant constraints, or use a solver of the underlying ODE such as "
-                    "OrthogonalProjection."
-                )
-            ode = MechanicalODE.of(system, t, state, args)
-            multipliers = ode.multipliers(t, ode.encode(state))
-            y = jnp.concatenate([y[: form.layout.size], multipliers, jnp.zeros(form.extra - multipliers.size, y.dtype)])
+        if rank is not None:
+            raise ValueError(
+                "Some constraints are redundant, which leaves their multipliers undetermined: a residual needs "
+                "independent ones. Remove the redundant constraints, or use a solver of the underlying ODE such as "
+                "OrthogonalProjection."
+            )
+        form, y = form.at_start(t, state)
         pencil = Pencil.of(form, y, self.variable_index)
         return y, pencil.starting(t, y)
 

@@ -3,7 +3,7 @@
 import functools
 import inspect
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from ..constraints import MechanicalODE, at_one_instant
 from ..linalg import newton, semidefinite_solve
+from ..states import NUMBERS
 from .differentiation import AbstractFormulation
 
 
@@ -33,8 +34,20 @@ class StateSpace(AbstractFormulation):
     Errors: a chart of the wrong dimension or one that does not reach the initial state is refused.
     """
 
+    inverts_mass: ClassVar[bool] = False
+
     chart: Callable[..., Any]
     guess: Any = None
+
+    def __check_init__(self) -> None:
+        if not callable(self.chart):
+            raise TypeError(f"`chart` of StateSpace must be a function from coordinates z to q, but is {self.chart!r}.")
+        if self.guess is not None and not isinstance(self.guess, (*NUMBERS, list, tuple)):
+            raise TypeError(f"`guess` of StateSpace must be a vector of coordinates, but is {self.guess!r}.")
+
+    @property
+    def keeps(self) -> tuple[bool, bool]:
+        return True, True
 
     def encode(
         self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None
@@ -45,7 +58,7 @@ class StateSpace(AbstractFormulation):
                 "StateSpace needs a system whose constraints are all holonomic: no coordinates satisfy a nonholonomic "
                 "constraint by construction. Use OrthogonalProjection or TangentSpace."
             )
-        constraints = mechanical.holonomic if mechanical.rank is None else mechanical.rank
+        constraints = mechanical.holonomic if mechanical.rank is None else mechanical.rank[0]
         ode = ChartODE(mechanical, self.chart, _takes_time(self.chart), mechanical.layout.size - constraints)
         return ode.encode(t, mechanical.encode(state), self.guess), ode
 

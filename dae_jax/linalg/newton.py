@@ -73,12 +73,14 @@ def fixed_point(
     """
     dtype = jnp.result_type(*jax.tree.leaves(x))
     tolerance = roundoff(dtype)
+    # Near a singular point round-off is amplified so much that corrections end below this without shrinking to less.
+    noise = float(jnp.finfo(dtype).eps) ** 0.55
     one = jnp.ones((), dtype)
 
     def unfinished(carry: Any) -> Bool[Array, ""]:
         _, last, previous, count = carry
         remaining = last * jnp.minimum(last / previous, 1)
-        stagnant = (last > previous / 2) & (last < 1000 * tolerance)
+        stagnant = (last > previous / 2) & (last < 1000 * tolerance) | (last >= previous) & (last < noise)
         # A NaN compares false and ends the loop.
         return (count < max_steps) & (remaining > tolerance) & ~stagnant
 
@@ -91,7 +93,7 @@ def fixed_point(
     start = (x, jnp.full((), jnp.inf, dtype), one, 0) if last is None else (x, last, one, 1)
     x, size, previous, _ = lax.while_loop(unfinished, body, start)
     remaining = size * jnp.minimum(size / previous, 1)
-    return x, (remaining <= tolerance) | (size < 1000 * tolerance)
+    return x, (remaining <= tolerance) | (size < 1000 * tolerance) | (size >= previous) & (size < noise)
 
 
 def implicit_root(

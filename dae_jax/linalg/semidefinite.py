@@ -23,7 +23,7 @@ def semidefinite_solve(
     Numerical Algorithms*, ch. 10). A pivot that is not positive beyond round-off gives NaN: the system is not definite,
     and no number would be right.
 
-    In the semidefinite case the `rank` largest eigenvalues are kept, by LAPACK.
+    In the semidefinite case the `rank` largest eigenvalues are kept, by LAPACK; NaN where one of them is round-off.
     """
     m = s.shape[0]
     if rank is not None and rank < m:
@@ -123,5 +123,8 @@ def _(rank: int, primals: Any, tangents: Any) -> Any:
 
 def _pseudo_inverse(s: Float[Array, "m m"], rank: int) -> Float[Array, "m m"]:
     values, vectors = jnp.linalg.eigh(s)
+    if rank:
+        least = 8 * s.shape[0] * float(jnp.finfo(s.dtype).eps) * values[-1]
+        values = jnp.where(values[s.shape[0] - rank] > least, values, jnp.nan)
     values, vectors = values[s.shape[0] - rank :], vectors[:, s.shape[0] - rank :]
     return jnp.dot(vectors / values, vectors.T)

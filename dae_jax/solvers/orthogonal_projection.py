@@ -6,8 +6,10 @@ import diffrax
 import jax
 import jax.numpy as jnp
 
+from ..states import brief
 from .explicit import unrolled, with_landing
 from .manifold import AbstractManifoldSolver, clock, or_nan, outcome
+from .residual_steps import AbstractResidualSolver
 
 
 class OrthogonalProjection(diffrax.AbstractWrappedSolver, AbstractManifoldSolver):
@@ -31,6 +33,14 @@ class OrthogonalProjection(diffrax.AbstractWrappedSolver, AbstractManifoldSolver
     """
 
     solver: diffrax.AbstractSolver
+
+    def __check_init__(self) -> None:
+        keeps = isinstance(self.solver, AbstractManifoldSolver | AbstractResidualSolver)
+        if keeps or not isinstance(self.solver, diffrax.AbstractSolver):
+            alone = ", which keeps the constraints by itself: use it without OrthogonalProjection" if keeps else ""
+            raise ValueError(
+                f"OrthogonalProjection takes a solver of ODEs such as diffrax.Tsit5(), but got {brief(self.solver)}{alone}."
+            )
 
     @property
     def term_structure(self) -> Any:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from ..linalg import newton
+from ..states import brief
 from .implicit import AbstractImplicitSolver, hermite, predictor, stage_end, stage_residual, vector_field
 from .manifold import AbstractManifoldSolver, clock, or_nan, outcome
 
@@ -35,7 +36,7 @@ class SymmetricProjection(AbstractManifoldSolver):
     def __check_init__(self) -> None:
         if not isinstance(self.solver, AbstractImplicitSolver):
             raise ValueError(
-                f"SymmetricProjection takes a symmetric method, Trapezoid(), Midpoint() or Gauss4(), but got {self.solver}."
+                f"SymmetricProjection takes a symmetric method, Trapezoid(), Midpoint() or Gauss4(), but got {brief(self.solver)}."
             )
 
     def order(self, terms: Any) -> Any:

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from ..states import brief
 from .explicit import Unrolled, identity, unrolled
 from .manifold import AbstractManifoldSolver, clock, or_nan, outcome
 
@@ -60,7 +61,7 @@ class TangentSpace(AbstractManifoldSolver, diffrax.AbstractAdaptiveSolver):
     def __check_init__(self) -> None:
         if not hasattr(unrolled(self.solver), "landing_step"):
             raise ValueError(
-                f"TangentSpace takes an explicit Runge–Kutta solver such as diffrax.Tsit5(), but got {self.solver}. "
+                f"TangentSpace takes an explicit Runge–Kutta solver such as diffrax.Tsit5(), but got {brief(self.solver)}. "
                 "For an implicit one use OrthogonalProjection."
             )
 

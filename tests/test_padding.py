@@ -1,0 +1,119 @@
+"""Saved times that are padding, of steps, of solves that ended early, change no diagnostic."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dae_jax
+from dae_jax import plotting, reductions
+from dae_jax.scenes import pendulum
+
+
+SCENE = pendulum()
+PROJECTED = dae_jax.OrthogonalProjection(diffrax.Tsit5())
+TIMES = np.linspace(0.0, 1.0, 11)
+# Half a metre above the lowest point: before the end.
+LOW = diffrax.Event(lambda t, y, args, **_: y[0][1] - 0.5)
+
+
+def solve(solver=diffrax.Tsit5(), **options):  # noqa: B008
+    return dae_jax.daesolve(SCENE.system, solver, 0.0, 1.0, None, SCENE.y0, SCENE.args, **options)
+
+
+CASES = {
+    "steps": {"saveat": diffrax.SaveAt(t0=True, steps=True)},
+    "event": {"saveat": diffrax.SaveAt(ts=TIMES), "event": LOW},
+    "failed": {"saveat": diffrax.SaveAt(ts=TIMES), "max_steps": 12, "throw": False},
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("batched", [False, True], ids=["alone", "vmap"])
+def test_padding_is_the_last_value(name, batched):
+    if batched:
+        # Times and states of a batch of one: under `vmap` of the solve, and of a batch of solutions.
+        run = jax.vmap(lambda a: solve_at(a, **CASES[name]))
+        many = run(jnp.zeros(1))
+        one = lambda x: jax.tree.map(lambda x: x[0], x)
+    else:
+        many, one = solve(**CASES[name]), lambda x: x
+    sol = one(many)
+    saved = int(np.isfinite(sol.ts).sum())
+    assert 0 < saved < len(sol.ts)
+    for diagnostic in (dae_jax.drift, dae_jax.energy, dae_jax.multipliers):
+        found = one(diagnostic(SCENE.system, many))
+        exact = at_each(diagnostic, sol, saved)
+        for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(exact), strict=True):
+            np.testing.assert_allclose(a[:saved], b, rtol=1e-12, atol=1e-14)
+            np.testing.assert_array_equal(a[saved:], np.broadcast_to(a[saved - 1], a[saved:].shape))
+    for a, b in zip(jax.tree.leaves(one(many.final)), jax.tree.leaves(sol.ys), strict=True):
+        np.testing.assert_array_equal(a, b[saved - 1])
+    assert reductions.largest_drift(SCENE.system, sol) == max(x.max() for x in dae_jax.drift(SCENE.system, sol))
+    assert np.isfinite(reductions.energy_error(SCENE.system, sol))
+
+
+def solve_at(shift, **options):
+    y0 = (jnp.asarray(SCENE.y0[0]) + 0 * shift, jnp.asarray(SCENE.y0[1]))
+    return dae_jax.daesolve(SCENE.system, diffrax.Tsit5(), 0.0, 1.0, None, y0, SCENE.args, **options)
+
+
+def at_each(diagnostic, sol, saved):
+    """The diagnostic of a solution that has the saved times only."""
+    import dataclasses
+
+    cut = dataclasses.replace(sol, ts=sol.ts[:saved], ys=jax.tree.map(lambda y: y[:saved], sol.ys))
+    return diagnostic(SCENE.system, cut)
+
+
+def test_a_batch_of_solutions_is_each_of_them():
+    def run(k):
+        system = dae_jax.ConstrainedSystem(lambda t, q, v, k: jnp.stack([0 * k, k]), SCENE.system.constraint)
+        return system, dae_jax.daesolve(
+            system, diffrax.Tsit5(), 0.0, 1.0, None, SCENE.y0, k, saveat=CASES["steps"]["saveat"]
+        )
+
+    forces = jnp.array([1.0, 9.81])
+    together = jax.vmap(lambda k: run(k)[1])(forces)
+    found = dae_jax.multipliers(run(1.0)[0], together)
+    for i, k in enumerate(forces):
+        np.testing.assert_allclose(found[i], dae_jax.multipliers(*run(k)), rtol=1e-10)
+
+
+def test_largest_error_is_over_the_saved_times_and_infinite_for_a_failure():
+    ended = solve(**CASES["event"])
+    reference = SCENE.reference(TIMES)
+    assert reductions.largest_error(ended, reference) < 1e-6
+    assert np.isinf(reductions.largest_error(solve(**CASES["failed"]), reference))
+
+
+def test_padding_has_no_derivative():
+    def loss(g):
+        system = dae_jax.ConstrainedSystem(lambda t, q, v, g: jnp.stack([0 * g, g]), SCENE.system.constraint)
+        sol = dae_jax.daesolve(
+            system, PROJECTED, 0.0, 1.0, None, SCENE.y0, g, saveat=diffrax.SaveAt(steps=True), adjoint=diffrax.ForwardMode()
+        )  # fmt: skip
+        return dae_jax.multipliers(system, sol)[-1, 0]
+
+    tangent = jax.jvp(loss, (9.81,), (1.0,))[1]
+    h = 1e-5
+    np.testing.assert_allclose(tangent, (loss(9.81 + h) - loss(9.81 - h)) / (2 * h), rtol=1e-4)
+
+
+def test_pictures_leave_padding_out():
+    sol = solve(saveat=diffrax.SaveAt(t0=True, steps=True))
+    saved = np.isfinite(sol.ts)
+    times, path = np.asarray(sol.ts), np.asarray(sol.ys[0])
+    drift = np.asarray(dae_jax.drift(SCENE.system, sol).position)
+    for figure in (
+        plotting.trajectory(times, path, 0.5),
+        plotting.drift_growth({"Tsit5": (times, drift)}),
+        plotting.drift({"Tsit5": (times, drift)}),
+        plotting.energy({"Tsit5": (times, np.asarray(dae_jax.energy(SCENE.system, sol)))}),
+    ):
+        figure.canvas.draw()
+        for line in figure.axes[0].lines:
+            assert np.isfinite(line.get_xydata()).all()
+            assert len(line.get_xdata()) <= saved.sum()
+        assert not any("inf" in text.get_text() for legend in figure.legends for text in legend.get_texts())
