@@ -5,18 +5,21 @@ import os
 import sys
 from pathlib import Path
 
+from dae_jax.options import writable
+
 from . import chain, cost, stiff, sweep, timing, work_precision
 from .peers import NAMES, PACKAGES, load
 
 
 PARTS = {"work-precision": work_precision, "chain": chain, "cost": cost, "sweep": sweep, "stiff": stiff}
+QUICK = ("dae_jax_peer", "c_limit", "plain_diffrax")
 
 
 def main(argv=None):
     """Print the tables, write data and figures, and set the measurements against what they must reach."""
     parser = argparse.ArgumentParser(prog="dae-jax bench", description=__doc__)
     parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=PARTS, metavar="PART", help=", ".join(PARTS))
-    parser.add_argument("--peers", nargs="+", default=NAMES, choices=NAMES, metavar="PEER", help=", ".join(NAMES))
+    parser.add_argument("--peers", nargs="+", choices=NAMES, metavar="PEER", help=f"by default all: {', '.join(NAMES)}")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--quick", action="store_true", help="a smoke test: few points; this library, C and diffrax")
     parser.add_argument("--out", type=Path, default=timing.RESULTS, help="folder for data and figures")
@@ -24,13 +27,17 @@ def main(argv=None):
         "--synchronous", action="store_true", help="JAX computes in the calling thread, which saves waking another"
     )
     arguments = parser.parse_args(argv)
+    if arguments.repeats < 1:
+        parser.error(f"--repeats must be at least 1, but is {arguments.repeats}")
+    if arguments.quick and arguments.peers:
+        parser.error(f"--quick takes no --peers: it is for {', '.join(QUICK)}")
+    writable(parser, arguments.out)
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     if arguments.synchronous:
         import jax
 
         jax.config.update("jax_cpu_enable_async_dispatch", False)
-    names = [n for n in arguments.peers if not arguments.quick or n in ("dae_jax_peer", "c_limit", "plain_diffrax")]
-    peers = available(names)
+    peers = available(QUICK if arguments.quick else arguments.peers or NAMES)
     verdicts = []
     for part in arguments.parts:
         print(f"\n== {part}: {PARTS[part].__doc__}")

@@ -59,12 +59,12 @@ class Verification(NamedTuple):
 class BaumgarteLoss:
     """See `baumgarte_loss`. Called with {"alpha": α, "beta": β} it gives the loss."""
 
-    system: ConstrainedSystem
+    system: ConstrainedSystem = dataclasses.field(repr=False)
     y0: Any
     args: Any
-    times: Float[np.ndarray, " times"]
+    times: Float[np.ndarray, " times"] = dataclasses.field(repr=False)
     dt0: float
-    reference: Any
+    reference: Any = dataclasses.field(repr=False)
     solver: diffrax.AbstractSolver
     weights: tuple[float, float, float]
 
@@ -183,7 +183,7 @@ def baumgarte_loss(
     **Returns** a function of {"alpha": α, "beta": β} for `tune` and `sweep`, differentiable in forward mode; its method
     `parts` gives D, E and dt0 ρ, its method `verify` independent solves.
 
-    Errors: `ValueError` for a step that is not positive or a reference of another shape; `RuntimeError` where the
+    Errors: `ValueError` for a step that is not positive or a reference of another shape or not finite; `RuntimeError` where the
     reference cannot be solved for.
 
     Source: U. M. Ascher, H. Chin, L. R. Petzold, S. Reich, *Stabilization of constrained mechanical systems with DAEs and
@@ -207,6 +207,8 @@ def baumgarte_loss(
     found = jax.tree.map(jnp.shape, truth)
     if found != expected:
         raise ValueError(f"`reference` must give (q, v) of shapes {expected}, but gives {found}.")
+    if not all(np.isfinite(x).all() for x in jax.tree.leaves(truth)):
+        raise ValueError("`reference` must be finite at every time, but is not; leave it out to have it solved for.")
     return BaumgarteLoss(
         system, y0, args, saved, float(dt0), jax.tree.map(np.asarray, truth), solver, tuple(map(float, weights))
     )

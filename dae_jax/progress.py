@@ -15,16 +15,20 @@ class Progress:
         self.label, self.total, self.enabled, self.already = label, total, enabled, already
         self.start = self.shown = time.monotonic()
         self.width = 0
+        self.pending: tuple[int, str] | None = None
 
     def __enter__(self) -> "Progress":
         return self
 
     def show(self, done: int, note: str = "") -> None:
-        """Draws the bar, at most ten times a second, and at the end."""
+        """Draws the bar, at most ten times a second; the last state is drawn in any case, at the end."""
+        self.pending = done, note
+        if self.enabled and time.monotonic() - self.shown >= 0.1:
+            self._draw(done, note)
+
+    def _draw(self, done: int, note: str) -> None:
         now = time.monotonic()
-        if not self.enabled or (now - self.shown < 0.1 and done < self.total):
-            return
-        self.shown = now
+        self.shown, self.pending = now, None
         rate = (done - self.already) / max(now - self.start, 1e-9)
         left = f"{_clock((self.total - done) / rate)} left" if rate > 0 else "? left"
         filled = 20 * done // max(self.total, 1)
@@ -34,6 +38,8 @@ class Progress:
         self.width = len(line)
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if self.enabled and self.pending is not None:
+            self._draw(*self.pending)
         if self.width:
             print(file=sys.stderr, flush=True)
 

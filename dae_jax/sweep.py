@@ -5,11 +5,14 @@ import functools
 import hashlib
 import os
 import re
+import sys
+from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -81,7 +84,7 @@ def sweep(
     - `inputs`: a pytree of arrays with a common leading axis, or a `grid`.
     - `chunk_size`: elements of one compiled call; by default 128 for each CPU device, 8192 for each accelerator.
     - `devices`: by default all of this process. On one CPU device several chunks run at once, one for each core.
-    - `progress`: a bar on stderr, with the rate, the time left, and how many solves failed.
+    - `progress`: a bar on stderr, with the rate, the time left, and how many solves failed; at the end, why.
     - `store`: a folder. Results are written there as they come; the same sweep with the same folder goes on where it was
       interrupted, also by a kill, and ends with the same bits. The result's arrays are then files mapped into memory.
 
@@ -116,10 +119,13 @@ def sweep(
         if store is None
         else Store.open(Path(store), leaves, chunks, _fingerprint(fn, elements, chunk))
     )
-    failures = _count_failures(structure)
-    with Progress("sweep", size, progress and jax.process_index() == 0, chunk * int(np.sum(kept.done))) as shown:
+    failures = _failures(structure)
+    progress = progress and jax.process_index() == 0
+    with Progress("sweep", size, progress, chunk * int(np.sum(kept.done))) as shown:
         _run(call, elements, chunk, kept, devices, lambda: shown.show(*_state(kept, chunk, size, failures)))
     arrays = kept.collect(_gathered if jax.process_count() > 1 else None, chunk)
+    for code, count in failures(arrays).most_common() if progress else ():
+        print(f"  {count:,} × {_message(code)}", file=sys.stderr)
     if isinstance(inputs, Grid):
         arrays = [x.reshape(*inputs.shape, *x.shape[1:]) for x in arrays]
     return jax.tree.unflatten(structure, arrays)
@@ -202,24 +208,32 @@ def _result(future: Future[Any]) -> Any:
         ) from None
 
 
-def _count_failures(structure: Any) -> Callable[[list[np.ndarray]], int]:
-    """How many lanes have a result that is not a success, where the function returns results."""
+def _failures(structure: Any) -> Callable[[list[np.ndarray]], Counter[int]]:
+    """How many elements have which result that is not a success, where the function returns results."""
     numbered = jax.tree.unflatten(structure, range(structure.num_leaves))
     is_result = lambda x: isinstance(x, type(RESULTS.successful))
     places = [x._value for x in jax.tree.leaves(numbered, is_leaf=is_result) if is_result(x)]
     okay = [int(code._value) for code in (RESULTS.successful, RESULTS.event_occurred)]
 
-    def count(arrays: list[np.ndarray]) -> int:
-        failed = [~np.isin(arrays[place], okay) for place in places]
-        return int(np.sum(np.any([f.reshape(len(f), -1).any(1) for f in failed], axis=0))) if failed else 0
+    def count(arrays: list[np.ndarray]) -> Counter[int]:
+        if not places:
+            return Counter()
+        codes = np.concatenate([arrays[place].reshape(len(arrays[place]), -1) for place in places], axis=1)
+        failed = ~np.isin(codes, okay)
+        first = np.take_along_axis(codes, np.argmax(failed, 1)[:, None], 1)[failed.any(1)]
+        return Counter(dict(zip(*(x.tolist() for x in np.unique(first, return_counts=True)), strict=True)))
 
     return count
 
 
-def _state(kept: Any, chunk: int, size: int, failures: Callable[[list[np.ndarray]], int]) -> tuple[int, str]:
+def _message(code: int) -> str:
+    return RESULTS[eqx.tree_at(lambda result: result._value, RESULTS.successful, np.asarray(code))]
+
+
+def _state(kept: Any, chunk: int, size: int, failures: Callable[[list[np.ndarray]], Counter[int]]) -> tuple[int, str]:
     done = np.repeat(kept.done, chunk)[:size]
-    failed = failures([x[done] for x in kept.arrays])
-    return int(done.sum()), f"{failed} failed" if failed else ""
+    failed = failures([x[done] for x in kept.arrays]).total()
+    return int(done.sum()), f"{failed:,} failed" if failed else ""
 
 
 def _gathered(x: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """`tune`: gradient descent on positive parameters, many starts at once."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -37,6 +37,11 @@ class History(NamedTuple):
     params: PyTree
     gradient_norm: Float[Array, "starts steps"]
 
+    def __repr__(self) -> str:
+        """What it holds, in a line."""
+        starts, steps = self.loss.shape
+        return f"History(starts={starts}, steps={steps}, loss={self.loss[0, 0]:.6g} → {np.min(self.best):.6g})"
+
 
 class Tuned(NamedTuple):
     """What `tune` returns.
@@ -51,6 +56,11 @@ class Tuned(NamedTuple):
     loss: Float[Array, ""]
     history: History
     evaluations: int
+
+    def __repr__(self) -> str:
+        """The point, what was gained and at what cost, in a line."""
+        params = jax.tree.map(_short, self.params)
+        return f"Tuned(params={params}, loss={self.loss:.6g}, history={self.history}, evaluations={self.evaluations})"
 
 
 class _Point(NamedTuple):
@@ -100,6 +110,28 @@ def tune(
 
     Errors: `ValueError` for parameters that are not positive, and where the loss is finite nowhere.
     """
+    for tuned in descent(  # noqa: B007
+        loss, params, optimiser, steps=steps, starts=starts, progress=progress, spread=spread, patience=patience,
+        tolerance=tolerance, key=key,
+    ):  # fmt: skip
+        pass
+    return tuned
+
+
+def descent(
+    loss: Callable[[Any], Any],
+    params: PyTree,
+    optimiser: "optax.GradientTransformation | None" = None,
+    *,
+    steps: int,
+    starts: int = 1,
+    progress: bool = True,
+    spread: float = 10.0,
+    patience: int = 30,
+    tolerance: float = 1e-3,
+    key: Any = None,
+) -> Iterator[Tuned]:
+    """`tune`, with what was found so far after every few steps."""
     if not callable(loss):
         raise TypeError(f"`loss` must be a function of the parameters, but is {brief(loss)}.")
     logs, unravel = ravel_pytree(jax.tree.map(_checked_log, params))
@@ -113,9 +145,9 @@ def tune(
     key = jax.random.key(0) if key is None else key
     factors = jax.random.uniform(key, (starts, logs.size), logs.dtype, -1, 1) * jnp.log(spread)
     z = logs + factors.at[0].set(0)
-    of_params = lambda z: jnp.exp(z)
-    derivative, cost = _value_and_gradient(lambda z: loss(unravel(of_params(z))), logs)
-    advance = _compiled(derivative, optimiser, tolerance)
+    point_at = lambda z: unravel(jnp.exp(z))
+    derivative, cost = _value_and_gradient(lambda z: loss(point_at(z)), logs)
+    advance = _compiled(derivative, point_at, optimiser, tolerance)
     point = jax.vmap(lambda z: _Point(z, optimiser.init(z), z, jnp.asarray(jnp.inf, z.dtype), 0))(z)
     records = []
     with Progress("tune", steps, progress) as shown:
@@ -123,16 +155,25 @@ def tune(
             point, record = advance(point, min(BLOCK, steps - done))
             records.append(jax.tree.map(np.asarray, record))
             best = float(jnp.min(point.best))
-            shown.show(min(done + BLOCK, steps), f"best {best:.6g}")
             if not np.isfinite(best):
                 raise ValueError(f"`loss` or its gradient is not finite at any of the first {BLOCK} points.")
-            if int(jnp.min(point.stale)) >= patience:
-                break
-    visited, losses, bests, norms = (jnp.concatenate(x, axis=1) for x in zip(*records, strict=True))
-    winner = int(jnp.argmin(point.best))
-    at = jax.vmap(jax.vmap(lambda z: unravel(of_params(z))))(visited)
-    history = History(losses, bests, at, norms)
-    return Tuned(unravel(of_params(point.best_z[winner])), point.best[winner], history, losses.size * cost)
+            settled = int(jnp.min(point.stale)) >= patience
+            shown.total = min(done + BLOCK, steps) if settled else steps
+            shown.show(min(done + BLOCK, steps), f"best {best:.6g}{settled * ', settled'}")
+            history = History(*jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x, axis=1)), *records))
+            winner = int(jnp.argmin(point.best))
+            found = jax.tree.map(jnp.asarray, point_at(point.best_z[winner]))
+            yield Tuned(found, point.best[winner], history, history.loss.size * cost)
+            if settled:
+                return
+
+
+def _short(x: Any) -> Any:
+    """A number to six digits, a few of them as a list, many as their shape."""
+    x = np.asarray(x)
+    if x.size > FEW:
+        return f"{x.dtype}{list(x.shape)}"
+    return np.vectorize(lambda number: float(f"{number:.6g}"), otypes=[float])(x).tolist()
 
 
 def _checked_log(p: Any) -> Any:
@@ -161,7 +202,9 @@ def _value_and_gradient(f: Callable[..., Any], z: Any) -> tuple[Callable[..., An
     return first
 
 
-def _compiled(derivative: Callable[..., Any], optimiser: Any, tolerance: float) -> Callable[..., Any]:
+def _compiled(
+    derivative: Callable[..., Any], point_at: Callable[..., Any], optimiser: Any, tolerance: float
+) -> Callable[..., Any]:
     def step(point: _Point, _: Any) -> tuple[_Point, Any]:
         value, gradient = derivative(point.z)
         fine = jnp.isfinite(value) & jnp.all(jnp.isfinite(gradient))
@@ -177,7 +220,7 @@ def _compiled(derivative: Callable[..., Any], optimiser: Any, tolerance: float) 
             best,
             jnp.where(improved, 0, point.stale + 1),
         )
-        return after, (point.z, value, best, jnp.linalg.norm(gradient))
+        return after, (value, best, point_at(point.z), jnp.linalg.norm(gradient))
 
     @functools.partial(jax.jit, static_argnums=1)
     def advance(point: _Point, count: int) -> tuple[_Point, Any]:

@@ -114,6 +114,6 @@ def test_pictures_leave_padding_out():
     ):
         figure.canvas.draw()
         for line in figure.axes[0].lines:
-            assert np.isfinite(line.get_xydata()).all()
+            assert np.isfinite(line.get_xdata()).all()
             assert len(line.get_xdata()) <= saved.sum()
         assert not any("inf" in text.get_text() for legend in figure.legends for text in legend.get_texts())

@@ -13,7 +13,7 @@ from .pendulum import (
     pendulum as pendulum,
     spherical_pendulum as spherical_pendulum,
 )
-from .scene import Scene as Scene
+from .scene import Drawing as Drawing, Scene as Scene
 from .stiff_mechanisms import andrews as andrews, car_axis as car_axis
 from .surfaces import bead_on_torus as bead_on_torus, knife_edge as knife_edge
 
@@ -40,3 +40,5 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "slider-crank": slider_crank,
     "spherical-pendulum": spherical_pendulum,
 }
+# The scene whose two initial angles `dae-jax sweep angles` varies.
+ANGLES = "double-pendulum"

@@ -22,7 +22,7 @@ def robertson() -> Scene:
     system = SemiExplicitDAE(f, lambda t, x, z, args: jnp.stack([x[0] + x[1] + z[0] - 1]))
     end = (np.array([0.2083340149701255e-7, 0.8333360770334713e-13]), np.array([0.9999999791665050]))
     start = (np.array([1.0, 0.0]), np.array([0.0]))
-    return Scene("robertson", system, start, 1e11, published(1e11, end), index=1, scale=1e-6, stiff=True)
+    return Scene("robertson", system, start, 1e11, published(1e11, end), index=1, scale=1e-6, stiff=True, first=1e-6)
 
 
 def akzo_nobel() -> Scene:

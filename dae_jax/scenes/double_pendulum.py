@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..systems import ConstrainedSystem
-from .scene import Scene, State, minimal
+from .scene import Drawing, Scene, State, minimal
 
 
 def double_pendulum(angle1: float = np.pi / 2, angle2: float = np.pi / 2, gravity: float = 9.81) -> Scene:
@@ -23,7 +23,10 @@ def double_pendulum(angle1: float = np.pi / 2, angle2: float = np.pi / 2, gravit
         [jnp.sin(z[0]), jnp.cos(z[0]), jnp.sin(z[0]) + jnp.sin(z[1]), jnp.cos(z[0]) + jnp.cos(z[1])]
     )
     y0 = _embed(0.0, np.array(start))
-    return Scene("double-pendulum", system, y0, 10.0, minimal(_chain_field(gravity), start, _embed), 12.0, chart)
+    return Scene(
+        "double-pendulum", system, y0, 10.0, minimal(_chain_field(gravity), start, _embed), 12.0, chart,
+        drawing=_drawing(2, 2.0), paper=("fig7_baumgarte", "fig8_state_space"),
+    )  # fmt: skip
 
 
 def chain(n: int = 8, gravity: float = 9.81) -> Scene:
@@ -42,7 +45,14 @@ def chain(n: int = 8, gravity: float = 9.81) -> Scene:
     )
     start = [np.pi / 2] * n + [0.0] * n
     y0 = _embed(0.0, np.array(start))
-    return Scene(f"chain-{n}", system, y0, 1.0, minimal(_chain_field(gravity), start, _embed), 2.0)
+    reference = minimal(_chain_field(gravity), start, _embed)
+    return Scene(f"chain-{n}", system, y0, 1.0, reference, 2.0, drawing=_drawing(n, 1.0))
+
+
+def _drawing(n: int, t1: float) -> Drawing:
+    points = lambda t, q: jnp.concatenate([jnp.zeros((1, 2)), q.reshape(n, 2)])
+    shown = {f"mass {i}": i for i in ((1, 2) if n == 2 else (1, n // 2, n))}
+    return Drawing(points, shown, links=tuple((i, i + 1) for i in range(n)), down=True, t1=t1)
 
 
 def _chain_field(gravity: float):

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..systems import ConstrainedSystem
-from .scene import Scene, State, minimal
+from .scene import Drawing, Scene, State, minimal
 
 
 def slider_crank(crank: float = 1.0, rod: float = 2.5, gravity: float = 9.81) -> Scene:
@@ -39,7 +39,14 @@ def slider_crank(crank: float = 1.0, rod: float = 2.5, gravity: float = 9.81) ->
 
     chart = lambda z: jnp.stack([z[0], crank * jnp.sin(z[0]) + jnp.sqrt(rod**2 - crank**2 * jnp.cos(z[0]) ** 2)])
     start = [2.0, 0.5]
-    return Scene("slider-crank", system, embed(0.0, np.array(start)), 10.0, minimal(field, start, embed), chart=chart)
+
+    def points(t, q):
+        pin = crank * jnp.stack([jnp.sin(q[0]), jnp.cos(q[0])])
+        return jnp.stack([jnp.zeros(2), pin, jnp.stack([q[1], 0 * q[1]])])
+
+    drawing = Drawing(points, {"crank pin": 1, "slider": 2}, links=((0, 1), (1, 2)), down=True, t1=2.0)
+    y0, reference = embed(0.0, np.array(start)), minimal(field, start, embed)
+    return Scene("slider-crank", system, y0, 10.0, reference, chart=chart, drawing=drawing)
 
 
 def four_bar(redundant: bool = False, base: float = 2.0, gravity: float = 9.81) -> Scene:
@@ -71,4 +78,12 @@ def four_bar(redundant: bool = False, base: float = 2.0, gravity: float = 9.81) 
     field = lambda t, z: np.array([z[1], -gravity * np.sin(z[0])])
     name = "four-bar-redundant" if redundant else "four-bar"
     chart = lambda z: jnp.stack([jnp.sin(z[0]), jnp.cos(z[0]), base + jnp.sin(z[0]), jnp.cos(z[0])])
-    return Scene(name, system, embed(0.0, np.array(start)), 10.0, minimal(field, start, embed), chart=chart)
+
+    def points(t, q):
+        left, right, base_left, base_right = q[:2], q[2:], jnp.zeros(2), jnp.asarray(pivot)
+        return jnp.stack([base_left, left, right, base_right, base_right / 2, (left + right) / 2])
+
+    rods = ((0, 1), (1, 2), (2, 3), (4, 5)) if redundant else ((0, 1), (1, 2), (2, 3))
+    drawing = Drawing(points, {"left pin": 1, "right pin": 2}, links=rods, down=True, t1=1.0)
+    y0, reference = embed(0.0, np.array(start)), minimal(field, start, embed)
+    return Scene(name, system, y0, 10.0, reference, chart=chart, drawing=drawing)

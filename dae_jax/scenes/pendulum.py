@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..systems import ConstrainedSystem
-from .scene import Scene, State, minimal
+from .scene import Drawing, Scene, State, minimal
 
 
 def pendulum(angle: float = np.pi / 2, angular_velocity: float = 0.0, gravity: float = 9.81) -> Scene:
@@ -26,7 +26,9 @@ def pendulum(angle: float = np.pi / 2, angular_velocity: float = 0.0, gravity: f
         return np.stack([sine, cosine], -1), rate[:, None] * np.stack([cosine, -sine], -1)
 
     chart = lambda z: jnp.stack([jnp.sin(z[0]), jnp.cos(z[0])])
-    return Scene("pendulum", system, (q0, v0), 10.0, reference, chart=chart)
+    drawing = Drawing(lambda t, q: jnp.stack([jnp.zeros(2), q]), {"mass": 1}, links=((0, 1),), down=True, t1=1.0)
+    paper = ("fig4_drift_off", "fig5_euler_speed", "fig6_phase_portrait")
+    return Scene("pendulum", system, (q0, v0), 10.0, reference, chart=chart, drawing=drawing, paper=paper)
 
 
 def _exact(t: np.ndarray, angle: float, rate: float, gravity: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -75,8 +77,10 @@ def moving_pivot_pendulum(amplitude: float = 0.3, frequency: float = 3.0, gravit
 
     start = [1.0, 0.0]
     chart = lambda t, z, args: pivot(t) + jnp.stack([jnp.sin(z[0]), jnp.cos(z[0])])
-    y0 = embed(0.0, np.array(start))
-    return Scene("moving-pivot-pendulum", system, y0, 10.0, minimal(field, start, embed), chart=chart)
+    y0, reference = embed(0.0, np.array(start)), minimal(field, start, embed)
+    points = lambda t, q: jnp.stack([pivot(t), q])
+    drawing = Drawing(points, {"pivot": 0, "mass": 1}, links=((0, 1),), down=True, t1=2.0)
+    return Scene("moving-pivot-pendulum", system, y0, 10.0, reference, chart=chart, drawing=drawing)
 
 
 def spherical_pendulum(polar: float = 1.0, azimuthal_rate: float = 2.0, gravity: float = 9.81) -> Scene:
@@ -104,4 +108,7 @@ def spherical_pendulum(polar: float = 1.0, azimuthal_rate: float = 2.0, gravity:
         return q, np.array([rate * c * cp - turn * s * sp, rate * c * sp + turn * s * cp, -rate * s])
 
     start = [polar, 0.0, 0.0]
-    return Scene("spherical-pendulum", system, embed(0.0, np.array(start)), 10.0, minimal(field, start, embed))
+    y0, reference = embed(0.0, np.array(start)), minimal(field, start, embed)
+    axes = ("x in m, seen from above", "y in m")
+    drawing = Drawing(lambda t, q: jnp.stack([jnp.zeros(2), q[:2]]), {"mass": 1}, links=((0, 1),), t1=2.5, axes=axes)
+    return Scene("spherical-pendulum", system, y0, 10.0, reference, drawing=drawing)

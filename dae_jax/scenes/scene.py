@@ -15,6 +15,27 @@ State = tuple[np.ndarray, np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True)
+class Drawing:
+    """How a mechanism looks in the plane.
+
+    - `points(t, q)`: the positions (points, 2) of pivots, joints and masses, in m; a JAX function.
+    - `masses`: the points whose paths are of interest, by their names.
+    - `links`, `springs`: the pairs of points with a rigid body or a spring between them.
+    - `down`: whether the second coordinate points down.
+    - `t1`: until when paths can be told apart, in s.
+    - `axes`: what the two coordinates are.
+    """
+
+    points: Callable[[Any, Any], Any]
+    masses: dict[str, int]
+    links: tuple[tuple[int, int], ...] = ()
+    springs: tuple[tuple[int, int], ...] = ()
+    down: bool = False
+    t1: float = np.inf
+    axes: tuple[str, str] = ("x in m", "y in m")
+
+
+@dataclasses.dataclass(frozen=True)
 class Scene:
     """A system, where it starts, and a reference that does not use the library.
 
@@ -28,6 +49,9 @@ class Scene:
     - `scale`: the size below which a variable counts as zero: atol = scale · rtol, and errors are relative to the larger
       of it and the reference.
     - `stiff`: explicit methods are out of the question.
+    - `first`: where the solution changes over decades of time: when it begins to, in s.
+    - `drawing`: how to draw it, a mechanism in the plane.
+    - `paper`: the paper's figures that show it, by their names in `dae-jax compare`.
     """
 
     name: str
@@ -41,6 +65,15 @@ class Scene:
     index: int = 3
     scale: float = 1.0
     stiff: bool = False
+    first: float | None = None
+    drawing: Drawing | None = None
+    paper: tuple[str, ...] = ()
+
+    def times(self, t1: float, count: int) -> np.ndarray:
+        """So many times from 0 to `t1`, evenly spaced; in the logarithm where the solution changes over decades."""
+        if self.first is None or self.first >= t1:
+            return np.linspace(0.0, t1, count)
+        return np.concatenate([[0.0], np.geomspace(self.first, t1, count - 1)])
 
     def error(self, times: np.ndarray, ys: Any) -> float:
         """The largest error of states at the given times, relative where the reference is larger than `scale`."""

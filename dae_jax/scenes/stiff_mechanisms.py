@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..systems import ConstrainedSystem
-from .scene import Scene, published
+from .scene import Drawing, Scene, published
 
 
 def car_axis() -> Scene:
@@ -36,7 +36,11 @@ def car_axis() -> Scene:
     start = (np.array([0.0, 0.5, 1.0, 0.5]), np.array([-0.5, 0.0, -0.5, 0.0]))
     q = [0.493455784275402809e-1, 0.496989460230171153861, 0.104174252488542151681e1, 0.373911027265361256927]
     v = [-0.770583684040972357970e-1, 0.744686658723778553466e-2, 0.175568157537232222276e-1, 0.770341043779251976443]
-    return Scene("car-axis", system, start, 3.0, published(3.0, (np.array(q), np.array(v))), index=3)
+    points = lambda t, q: jnp.stack([jnp.zeros(2), q[:2], q[2:], road(t)])
+    ends = {"left end": 1, "right end": 2, "right wheel": 3}
+    drawing = Drawing(points, ends, links=((1, 2),), springs=((0, 1), (2, 3)))
+    reference = published(3.0, (np.array(q), np.array(v)))
+    return Scene("car-axis", system, start, 3.0, reference, index=3, drawing=drawing)
 
 
 def andrews() -> Scene:
@@ -111,4 +115,18 @@ def andrews() -> Scene:
     end = [15.81077119629904, -15.75637105984298, 0.04082224013073101, -0.5347301163226948]
     end += [0.5244099658805304, 0.5347301163226948, 1.048080741042263]
     reference = published(0.03, (np.array(end), np.full(7, np.nan)))
-    return Scene("andrews", system, (np.array(q0), np.zeros(7)), 0.03, reference, index=3)
+
+    def points(t, q):
+        beta, theta, gamma, _, delta, _, epsilon = q
+        along = lambda angle: jnp.stack([cos(angle), sin(angle)])
+        across = lambda angle: jnp.stack([sin(angle), -cos(angle)])
+        a, b, c = jnp.array([[xa, ya], [xb, yb], [xc, yc]])
+        f = rr * along(beta)
+        e = f - d * along(beta + theta)
+        spring = b + sc * across(gamma) + sd * along(gamma)
+        return jnp.stack([0 * f, f, e, a, b, c, spring, a + zt * along(delta), a + u * across(epsilon)])
+
+    bodies = ((0, 1), (1, 2), (2, 4), (4, 6), (2, 6), (2, 7), (3, 7), (2, 8), (3, 8))
+    shown = {"crank": 1, "common joint": 2, "upper joint": 7, "lower joint": 8}
+    drawing = Drawing(points, shown, links=bodies, springs=((5, 6),))
+    return Scene("andrews", system, (np.array(q0), np.zeros(7)), 0.03, reference, index=3, drawing=drawing)

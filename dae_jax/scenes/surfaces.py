@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..systems import ConstrainedSystem
-from .scene import Scene, State, minimal
+from .scene import Drawing, Scene, State, minimal
 
 
 def bead_on_torus(major: float = 2.0, minor: float = 1.0, gravity: float = 9.81) -> Scene:
@@ -39,7 +39,9 @@ def bead_on_torus(major: float = 2.0, minor: float = 1.0, gravity: float = 9.81)
         q = np.array([rho * c, rho * s, minor * np.sin(theta)])
         return q, np.array([drho * c - rho * turn * s, drho * s + rho * turn * c, minor * np.cos(theta) * rate])
 
-    return Scene("bead-on-torus", system, embed(0.0, np.array(start)), 5.0, minimal(field, start, embed), 10.0)
+    y0, reference = embed(0.0, np.array(start)), minimal(field, start, embed)
+    drawing = Drawing(lambda t, q: q[None, :2], {"bead": 0}, axes=("x in m, seen from above", "y in m"))
+    return Scene("bead-on-torus", system, y0, 5.0, reference, 10.0, drawing=drawing)
 
 
 def knife_edge(slope: float = 0.3, turn: float = 1.0, gravity: float = 9.81) -> Scene:
@@ -65,5 +67,12 @@ def knife_edge(slope: float = 0.3, turn: float = 1.0, gravity: float = 9.81) -> 
         speed = a / turn * s
         return q, np.stack([speed * c, speed * s, np.full_like(t, turn)], -1)
 
+    def points(t, q):
+        half = 0.25 * jnp.stack([jnp.sin(q[2]), jnp.cos(q[2])])
+        middle = q[1::-1]
+        return jnp.stack([middle - half, middle, middle + half])
+
+    axes = ("y in m, across the slope", "x in m, downhill")
+    drawing = Drawing(points, {"middle of the blade": 1}, links=((0, 2),), down=True, t1=6.0, axes=axes)
     q0, v0 = (x[0] for x in reference(np.zeros(1)))
-    return Scene("knife-edge", system, (q0, v0), 10.0, reference, index=2)
+    return Scene("knife-edge", system, (q0, v0), 10.0, reference, index=2, drawing=drawing)
