@@ -15,7 +15,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 
 from .gathers import gathered, scattered
-from .numbers import on_numbers
+from .numbers import converted, on_numbers
 
 
 ELEMENTWISE = frozenset(
@@ -165,9 +165,9 @@ class EntryByEntry:
             case "sub" if is_number(x[0], 0):
                 return self.negative(x[1])
             case "select_n" if is_number(x[0]):
-                return x[1 + int(x[0])]
+                return x[1 + min(max(int(x[0]), 0), len(x) - 2)]
             case "convert_element_type" if is_number(x[0]):
-                return np.asarray(x[0]).astype(eqn.params["new_dtype"])[()]
+                return converted(x[0], eqn.params["new_dtype"])
             case "div" if is_number(x[0], 0):
                 return x[0]
             case "integer_pow" if eqn.params["y"] == 1:
@@ -252,7 +252,7 @@ class EntryByEntry:
 
     def iota(self, eqn: Any, _: list[np.ndarray]) -> np.ndarray:
         shape, dimension = eqn.params["shape"], eqn.params["dimension"]
-        along = np.arange(shape[dimension], dtype=eqn.params["dtype"])
+        along = np.arange(shape[dimension]).astype(eqn.params["dtype"])
         along = along.reshape([-1 if i == dimension else 1 for i in range(len(shape))])
         return self.constant(np.broadcast_to(along, shape))
 

@@ -135,7 +135,7 @@ class Places(EntryByEntry):
         def put(index: list[Any], x: Any) -> None:
             at, inside = place(index)
             if eqn.primitive.name == "scatter-add":
-                x = self.combined("add", code.load(out.buffer, at), x)
+                x = self.combined("add", dtype, code.load(out.buffer, at), x)
             if inside is not None:
                 x = code.select(inside, x, code.load(out.buffer, at), out.buffer.kind)
             code.store(out.buffer, at, x)
