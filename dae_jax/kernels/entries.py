@@ -56,6 +56,11 @@ def is_number(x: Any, *which: float) -> bool:
     return isinstance(x, np.generic) and (not which or any(x == value for value in which))
 
 
+def as_indices(x: np.ndarray) -> np.ndarray:
+    """Known entries as integers of 64 bits; what is too large for one is the largest."""
+    return np.array([min(int(i), np.iinfo(np.int64).max) for i in x.ravel()], np.int64).reshape(x.shape)
+
+
 class EntryByEntry:
     """Runs jaxprs; gives up with `NotEntryByEntry` after more than `limit` operations.
 
@@ -271,7 +276,7 @@ class EntryByEntry:
         if not all(is_number(i) for i in indices.ravel()):
             raise NotEntryByEntry
         p, places = eqn.params, np.arange(x.size).reshape(x.shape)
-        moved = gathered(places, indices.astype(int), p["dimension_numbers"], p["slice_sizes"], p["mode"])
+        moved = gathered(places, as_indices(indices), p["dimension_numbers"], p["slice_sizes"], p["mode"])
         if (moved < 0).any():
             raise NotEntryByEntry
         return objects(x.ravel()[moved.ravel()], moved.shape)
@@ -289,7 +294,7 @@ class EntryByEntry:
         if not all(map(is_number, indices.ravel())):
             raise NotEntryByEntry
         p, places = eqn.params, np.arange(x.size).reshape(x.shape)
-        moved = scattered(places, indices.astype(int), updates.shape, p["dimension_numbers"], p["mode"])
+        moved = scattered(places, as_indices(indices), updates.shape, p["dimension_numbers"], p["mode"])
         combine = _SCATTERS[eqn.primitive.name]
         out = x.ravel().copy()
         for place, update in zip(moved.ravel(), updates.ravel(), strict=True):
