@@ -17,6 +17,7 @@ from jax.interpreters.partial_eval import dce_jaxpr
 
 from . import native, xla_kernel
 from .entries import NotEntryByEntry
+from .unchecked import without_checks
 
 
 kernel_p = Primitive("one_kernel")
@@ -27,6 +28,19 @@ def hindrances(jaxpr: ClosedJaxpr) -> tuple[str, ...]:
     """The names of the primitives in `jaxpr`, at any depth, that keep it from being one kernel; empty if none does."""
     found = native.hindrances(jaxpr)
     return found if found == () else xla_kernel.hindrances(jaxpr)
+
+
+def fused(fn: Callable[..., Any]) -> Callable[..., Any]:
+    """`fn` (pytrees of arrays to a pytree of arrays) as one kernel where it can be one; it has no derivative then."""
+
+    def traced(*args: Any) -> Any:
+        # A kernel knows of no mesh; JAX would write down for each number that it lies on none.
+        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)), args)
+        with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
+            jaxpr, out = jax.make_jaxpr(without_checks(fn), return_shape=True)(*shapes)
+        return jax.tree.unflatten(jax.tree.structure(out), called(jaxpr, jax.tree.leaves(args)))
+
+    return traced
 
 
 def called(jaxpr: ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
