@@ -5,6 +5,7 @@ polynomial) and what arithmetic on it means is up to its subclasses.
 """
 
 import functools
+import math
 import operator
 from collections.abc import Callable
 from typing import Any
@@ -25,7 +26,7 @@ ELEMENTWISE = frozenset(
 )
 STRUCTURAL = frozenset(
     "add_any broadcast_in_dim concatenate copy copy_p dot_general dynamic_slice expand_dims gather iota pad reduce_max "
-    "reduce_sum reshape rev slice split squeeze stack stop_gradient transpose".split()
+    "reduce_sum reshape rev slice split squeeze stack stop_gradient tile transpose".split()
 )
 _SCATTERS = {"scatter": None, "scatter-add": "total"}
 CALLS = {
@@ -54,6 +55,12 @@ def objects(entries: Any, shape: tuple[int, ...]) -> np.ndarray:
 def is_number(x: Any, *which: float) -> bool:
     """Whether an entry is known while tracing, and one of `which` where these are given."""
     return isinstance(x, np.generic) and (not which or any(x == value for value in which))
+
+
+def columns(x: np.ndarray, axes: tuple[int, ...]) -> np.ndarray:
+    """An array with these axes as its first one."""
+    x = np.moveaxis(x, axes, range(len(axes)))
+    return x.reshape((math.prod(x.shape[: len(axes)]), *x.shape[len(axes) :]))
 
 
 def as_indices(x: np.ndarray) -> np.ndarray:
@@ -189,9 +196,7 @@ class EntryByEntry:
         dtype = eqn.outvars[0].aval.dtype
         if identity and not jnp.issubdtype(dtype, jnp.floating):
             raise NotEntryByEntry
-        axes = eqn.params["axes"]
-        x = np.moveaxis(x, axes, range(len(axes)))
-        x = x.reshape((-1, *x.shape[len(axes) :]))
+        x = columns(x, eqn.params["axes"])
         first = np.asarray(identity, dtype)[()]
         return objects(
             [functools.reduce(combine, x[(slice(None), *i)], first) for i in np.ndindex(x.shape[1:])], x.shape[1:]
@@ -234,6 +239,9 @@ class EntryByEntry:
 
     def transpose(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
         return np.transpose(args[0], eqn.params["permutation"])
+
+    def tile(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
+        return np.tile(args[0], eqn.params["reps"])
 
     def rev(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
         return np.flip(args[0], eqn.params["dimensions"])

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from ..entries import ELEMENTWISE, STRUCTURAL, NotEntryByEntry, is_number, objects
+from ..entries import ELEMENTWISE, STRUCTURAL, NotEntryByEntry, columns, is_number, objects
 from ..numbers import on_numbers
 from .flat import flattened
 from .in_memory import FOLDS, LARGE, MORE_ELEMENTWISE, InMemory, identity, in_pairs
@@ -123,13 +123,10 @@ class Primitives(InMemory):
         return out
 
     def _folded(self, eqn: Any, x: np.ndarray) -> np.ndarray:
-        axes, dtype = eqn.params["axes"], np.dtype(eqn.outvars[0].aval.dtype)
-        x = np.moveaxis(x, axes, range(len(axes))).reshape((-1, *eqn.outvars[0].aval.shape))
+        x, dtype = columns(x, eqn.params["axes"]), np.dtype(eqn.outvars[0].aval.dtype)
         combine = functools.partial(self.combined, FOLDS[eqn.primitive.name], dtype)
-        columns = [list(x[(slice(None), *i)]) for i in np.ndindex(x.shape[1:])]
-        if not x.shape[0]:
-            columns = [[identity(FOLDS[eqn.primitive.name], dtype)]] * len(columns)
-        return objects([in_pairs(combine, column) for column in columns], x.shape[1:])
+        first = [] if x.shape[0] else [identity(FOLDS[eqn.primitive.name], dtype)]
+        return objects([in_pairs(combine, [*x[(slice(None), *i)], *first]) for i in np.ndindex(x.shape[1:])], x.shape[1:])
 
     def _accumulated(self, eqn: Any, x: np.ndarray) -> np.ndarray:
         combine = functools.partial(self.combined, _CUMULATIVE[eqn.primitive.name], eqn.outvars[0].aval.dtype)
