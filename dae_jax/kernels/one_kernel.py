@@ -83,10 +83,11 @@ def one_kernel(
 def _reverse(fn: Callable[..., Any], pull_back: PullBack | None, forward: Callable[..., Any]) -> Callable[..., Any]:
     def flat(*args: Any) -> Any:
         leaves, treedef = jax.tree.flatten(args)
+        kernel = fused(fn)
 
         @jax.custom_jvp
         def solve(*xs: Any) -> Any:
-            return fused(fn)(*jax.tree.unflatten(treedef, xs))
+            return kernel(*jax.tree.unflatten(treedef, xs))
 
         @solve.defjvp
         def _(xs: Any, dxs: Any) -> Any:
