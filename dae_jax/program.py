@@ -142,8 +142,9 @@ class Solve(eqx.Module):
         self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, rank: int | Rank | None
     ) -> tuple[DAESolution, Any]:
         numbers, arrays = self.kernel(system, t0, t1, dt0, y0, args, rank)
-        out = one_kernel(numbers, self.derivative(), self._pull_back(system, t0, t1, dt0, y0, args, rank))(arrays)
-        *fields, end = out.whole()
+        forward, _ = self._forwards().kernel(system, t0, t1, dt0, y0, args, rank)
+        pull_back = self._pull_back(system, t0, t1, dt0, y0, args, rank)
+        *fields, end = one_kernel(numbers, self.derivative(), pull_back, forward)(arrays).whole()
         check, check_arrays = self._check(system, t0, y0, args, rank, end)
         # A yes or no has no derivative.
         found = one_kernel(check, self.derivative())(jax.lax.stop_gradient(check_arrays))
@@ -204,7 +205,7 @@ class Solve(eqx.Module):
         def pull_back(inputs: Any, cotangent: Any) -> list[Any]:
             (arrays,) = inputs
             solve, *rest = program.inputs(arrays)
-            recording, also_arrays = dataclasses.replace(solve, saveat=recorded(solve.saveat)).kernel(*rest, rank)
+            recording, also_arrays = dataclasses.replace(solve._forwards(), saveat=recorded(solve.saveat)).kernel(*rest, rank)
             _, _, ts, ys, *_ = recording(also_arrays).numbers
             numbers, others = eqx.partition(arrays, eqx.is_inexact_array)
             fixed: list[Any] = []
@@ -228,6 +229,10 @@ class Solve(eqx.Module):
         solver = _economical(self.solver, self.between())
         view = _View(part.fn, _Decode(self.formulation, self.solver), args)
         return Taped(self.formulation, solver, part, t0, t1, y, ode, view)
+
+    def _forwards(self) -> "Solve":
+        """The same solve with forward derivatives."""
+        return dataclasses.replace(self, adjoint=diffrax.ForwardMode())
 
     def derivative(self) -> Any:
         """In which mode the adjoint allows derivatives; a progress meter needs callbacks."""

@@ -66,7 +66,8 @@ def daesolve(
       float32).
     - `saveat`, `adjoint`, `event`, `max_steps`, `throw`, `progress_meter`: as in diffrax. Functions in `saveat` and
       `event` get the state in the structure of `y0`, and the user's `args`. With a `Jump` as `event` the solve goes on
-      after it. Forward-mode derivatives need `adjoint=diffrax.ForwardMode()`.
+      after it. Second derivatives are there in any order of modes, third ones with `jax.jacfwd` outside; with a `Jump`,
+      a progress meter or without one kernel forward-mode derivatives need `adjoint=diffrax.ForwardMode()`.
 
     **Returns** a `DAESolution`.
 

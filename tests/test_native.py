@@ -379,3 +379,21 @@ def test_machine_code_is_kept_with_jax_s_own(tmp_path, monkeypatch):
             machine._object_code(text + "\n")
     finally:
         jax.config.update("jax_compilation_cache_dir", before)
+
+
+def test_a_broken_module_raises():
+    """LLVM's passes would end the process: a branch on a number that is defined in no block before it."""
+    broken = "define i64 @f(i1 %c) {\nentry:\nbr i1 %c, label %a, label %b\na:\n%x = add i64 1, 2\nbr label %b\nb:\nret i64 %x\n}"
+    with pytest.raises(NotEntryByEntry, match="LLVM"):
+        machine._object_code(broken)
+
+
+def test_code_made_by_other_passes_is_not_taken_from_the_cache(tmp_path, monkeypatch):
+    before = jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    try:
+        first = machine._cached("text")
+        monkeypatch.setattr(machine, "_SPEED", 3)
+        assert machine._cached("text") != first
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)

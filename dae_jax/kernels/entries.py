@@ -5,6 +5,7 @@ polynomial) and what arithmetic on it means is up to its subclasses.
 """
 
 import functools
+import math
 import operator
 from collections.abc import Callable
 from typing import Any
@@ -15,7 +16,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 
 from .gathers import gathered, scattered
-from .numbers import on_numbers
+from .numbers import converted, on_numbers
 
 
 ELEMENTWISE = frozenset(
@@ -25,7 +26,7 @@ ELEMENTWISE = frozenset(
 )
 STRUCTURAL = frozenset(
     "add_any broadcast_in_dim concatenate copy copy_p dot_general dynamic_slice expand_dims gather iota pad reduce_max "
-    "reduce_sum reshape rev slice split squeeze stack stop_gradient transpose".split()
+    "reduce_sum reshape rev slice split squeeze stack stop_gradient tile transpose".split()
 )
 _SCATTERS = {"scatter": None, "scatter-add": "total"}
 CALLS = {
@@ -54,6 +55,17 @@ def objects(entries: Any, shape: tuple[int, ...]) -> np.ndarray:
 def is_number(x: Any, *which: float) -> bool:
     """Whether an entry is known while tracing, and one of `which` where these are given."""
     return isinstance(x, np.generic) and (not which or any(x == value for value in which))
+
+
+def columns(x: np.ndarray, axes: tuple[int, ...]) -> np.ndarray:
+    """An array with these axes as its first one."""
+    x = np.moveaxis(x, axes, range(len(axes)))
+    return x.reshape((math.prod(x.shape[: len(axes)]), *x.shape[len(axes) :]))
+
+
+def as_indices(x: np.ndarray) -> np.ndarray:
+    """Known entries as integers of 64 bits; what is too large for one is the largest."""
+    return np.array([min(int(i), np.iinfo(np.int64).max) for i in x.ravel()], np.int64).reshape(x.shape)
 
 
 class EntryByEntry:
@@ -165,9 +177,9 @@ class EntryByEntry:
             case "sub" if is_number(x[0], 0):
                 return self.negative(x[1])
             case "select_n" if is_number(x[0]):
-                return x[1 + int(x[0])]
+                return x[1 + min(max(int(x[0]), 0), len(x) - 2)]
             case "convert_element_type" if is_number(x[0]):
-                return np.asarray(x[0]).astype(eqn.params["new_dtype"])[()]
+                return converted(x[0], eqn.params["new_dtype"])
             case "div" if is_number(x[0], 0):
                 return x[0]
             case "integer_pow" if eqn.params["y"] == 1:
@@ -184,9 +196,7 @@ class EntryByEntry:
         dtype = eqn.outvars[0].aval.dtype
         if identity and not jnp.issubdtype(dtype, jnp.floating):
             raise NotEntryByEntry
-        axes = eqn.params["axes"]
-        x = np.moveaxis(x, axes, range(len(axes)))
-        x = x.reshape((-1, *x.shape[len(axes) :]))
+        x = columns(x, eqn.params["axes"])
         first = np.asarray(identity, dtype)[()]
         return objects(
             [functools.reduce(combine, x[(slice(None), *i)], first) for i in np.ndindex(x.shape[1:])], x.shape[1:]
@@ -230,6 +240,9 @@ class EntryByEntry:
     def transpose(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
         return np.transpose(args[0], eqn.params["permutation"])
 
+    def tile(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
+        return np.tile(args[0], eqn.params["reps"])
+
     def rev(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
         return np.flip(args[0], eqn.params["dimensions"])
 
@@ -252,7 +265,7 @@ class EntryByEntry:
 
     def iota(self, eqn: Any, _: list[np.ndarray]) -> np.ndarray:
         shape, dimension = eqn.params["shape"], eqn.params["dimension"]
-        along = np.arange(shape[dimension], dtype=eqn.params["dtype"])
+        along = np.arange(shape[dimension]).astype(eqn.params["dtype"])
         along = along.reshape([-1 if i == dimension else 1 for i in range(len(shape))])
         return self.constant(np.broadcast_to(along, shape))
 
@@ -271,7 +284,7 @@ class EntryByEntry:
         if not all(is_number(i) for i in indices.ravel()):
             raise NotEntryByEntry
         p, places = eqn.params, np.arange(x.size).reshape(x.shape)
-        moved = gathered(places, indices.astype(int), p["dimension_numbers"], p["slice_sizes"], p["mode"])
+        moved = gathered(places, as_indices(indices), p["dimension_numbers"], p["slice_sizes"], p["mode"])
         if (moved < 0).any():
             raise NotEntryByEntry
         return objects(x.ravel()[moved.ravel()], moved.shape)
@@ -289,7 +302,7 @@ class EntryByEntry:
         if not all(map(is_number, indices.ravel())):
             raise NotEntryByEntry
         p, places = eqn.params, np.arange(x.size).reshape(x.shape)
-        moved = scattered(places, indices.astype(int), updates.shape, p["dimension_numbers"], p["mode"])
+        moved = scattered(places, as_indices(indices), updates.shape, p["dimension_numbers"], p["mode"])
         combine = _SCATTERS[eqn.primitive.name]
         out = x.ravel().copy()
         for place, update in zip(moved.ravel(), updates.ravel(), strict=True):

@@ -1,5 +1,6 @@
 """Which entries a gather reads and a scatter writes, found without JAX: an operation on numbers would be compiled for each shape."""
 
+import math
 from typing import Any
 
 import jax
@@ -19,7 +20,7 @@ def gathered(
         starts[..., axis] = np.indices(batch)[of_batch]
     inside = np.all((starts >= 0) & (starts <= shape - sizes), -1)
     starts = np.clip(starts, 0, shape - sizes)
-    offsets = np.indices(slice_sizes).reshape(len(shape), -1).T
+    offsets = np.indices(slice_sizes).reshape(len(shape), math.prod(slice_sizes)).T
     found = places[tuple(np.moveaxis(starts[..., None, :] + offsets, -1, 0))]
     if jax.lax.GatherScatterMode.from_any(mode) is jax.lax.GatherScatterMode.FILL_OR_DROP:
         found = np.where(inside[..., None], found, -1)

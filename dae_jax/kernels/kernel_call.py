@@ -17,6 +17,7 @@ from jax.interpreters.partial_eval import dce_jaxpr
 
 from . import native, xla_kernel
 from .entries import NotEntryByEntry
+from .unchecked import without_checks
 
 
 kernel_p = Primitive("one_kernel")
@@ -27,6 +28,29 @@ def hindrances(jaxpr: ClosedJaxpr) -> tuple[str, ...]:
     """The names of the primitives in `jaxpr`, at any depth, that keep it from being one kernel; empty if none does."""
     found = native.hindrances(jaxpr)
     return found if found == () else xla_kernel.hindrances(jaxpr)
+
+
+def fused(fn: Callable[..., Any]) -> Callable[..., Any]:
+    """`fn` (pytrees of arrays to a pytree of arrays) as one kernel where it can be one; it has no derivative then."""
+    known: dict[Any, Any] = {}
+
+    def traced(*args: Any) -> Any:
+        leaves, treedef = jax.tree.flatten(args)
+        shapes = tuple(jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)) for x in leaves)
+        jaxpr, out = known.get((treedef, shapes)) or _traced(fn, jax.tree.unflatten(treedef, shapes))
+        if not any(isinstance(x, jax.core.Tracer) for x in jaxpr.consts):
+            known[treedef, shapes] = jaxpr, out
+        return jax.tree.unflatten(out, called(jaxpr, leaves))
+
+    return traced
+
+
+def _traced(fn: Callable[..., Any], shapes: Any) -> tuple[ClosedJaxpr, Any]:
+    """The jaxpr, and the tree of the results."""
+    # A kernel knows of no mesh; JAX would write down for each number that it lies on none.
+    with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
+        jaxpr, out = jax.make_jaxpr(without_checks(fn), return_shape=True)(*shapes)
+    return jaxpr, jax.tree.structure(out)
 
 
 def called(jaxpr: ClosedJaxpr, args: Sequence[Any]) -> list[Any]:

@@ -24,6 +24,20 @@ def _lgamma(x: float) -> float:
 _OF_FLOATS = {"div": np.divide, "exp": np.exp, "lgamma": _lgamma}
 
 
+def converted(x: Any, dtype: Any) -> Any:
+    """Numbers as ones of another type, as XLA has it: into integers to the nearest there is, what is undefined to 0."""
+    x, dtype = np.asarray(x), np.dtype(dtype)
+    x = x.real if dtype.kind != "c" else x
+    with np.errstate(all="ignore"):
+        if x.dtype.kind != "f" or dtype.kind not in "iu":
+            return x.astype(dtype)[()]
+        info = np.iinfo(dtype)
+        # The largest integer may be no float: then the float above it is the first that is too large.
+        inside = (x > info.min) & (x < float(info.max))
+        limits = np.where(x > 0, info.max, np.where(np.isnan(x), 0, info.min)).astype(dtype)
+        return np.where(inside, np.where(inside, x, 0).astype(dtype), limits)[()]
+
+
 def on_numbers(eqn: Any, values: list[Any]) -> np.ndarray | None:
     """What an equation of a jaxpr with one output gives for numbers; `None` where numpy may see that differently."""
     name, dtype = eqn.primitive.name, eqn.outvars[0].aval.dtype

@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 
 from ..entries import NotEntryByEntry
+from ..numbers import converted
 from .instructions import BYTES, Complex, Instructions, Value, kind_of, parts
 
 
 _BITS = {"double": "i64", "float": "i32"}
 
 _OF_FLOATS = {"add": "fadd contract", "sub": "fsub contract", "mul": "fmul contract", "div": "fdiv", "rem": "frem"}
-_OF_INTEGERS = {
-    "add": "add", "sub": "sub", "mul": "mul", "and": "and", "or": "or", "xor": "xor", "shift_left": "shl",
-    "shift_right_logical": "lshr", "shift_right_arithmetic": "ashr",
-}  # fmt: skip
+_OF_INTEGERS = {"add": "add", "sub": "sub", "mul": "mul", "and": "and", "or": "or", "xor": "xor"}
+_OF_TRUTH_VALUES = {"add": "or", "mul": "and", "max": "or", "min": "and"}
+_SHIFTS = {"shift_left": "shl", "shift_right_logical": "lshr", "shift_right_arithmetic": "ashr"}
 _COMPARISONS = {"eq": "oeq", "ne": "une", "lt": "olt", "le": "ole", "gt": "ogt", "ge": "oge"}
 _INTRINSICS = {"sqrt": "sqrt", "abs": "fabs", "floor": "floor", "ceil": "ceil"}
 _ROOTS = {0.5: 1, 0.25: 2, 0.125: 3}
@@ -39,7 +39,7 @@ class Arithmetic(Instructions):
         if name in ("real", "imag"):
             return getattr(x[0], name)
         if name == "complex":
-            return Complex(*x)
+            return Complex(*x) if any(isinstance(y, Value) for y in x) else to.type(x[0] + 1j * x[1])
         if name == "pow" and to.kind == "f":  # of a whole number too
             return self._of_float(name, [x[0], self.convert(x[1], dtype, to)], kind_of(to), params)
         if dtype.kind == "c":
@@ -56,21 +56,38 @@ class Arithmetic(Instructions):
             return self.arithmetic("min", dtype, self.arithmetic("max", dtype, y, low), high)
         if dtype.kind == "f":
             return self._of_float(name, x, kind, params)
-        if name == "not":
-            return self.op("xor", kind, x[0], dtype.type(True if kind == "i1" else -1))
-        if name == "sign" and _signed(dtype):
-            return self.intrinsic("smax", kind, self.intrinsic("smin", kind, x[0], 1), -1)
-        if name == "abs" and _signed(dtype):
-            return self.intrinsic("smax", kind, x[0], self.op("sub", kind, 0, x[0]))
+        return self._of_integers(name, dtype, kind, *x)
+
+    def _of_integers(self, name: str, dtype: np.dtype, kind: str, *x: Any) -> Any:
+        if name in _SHIFTS:
+            return self._shifted(name, kind, *x)
+        match name:
+            case "not":
+                return self.op("xor", kind, x[0], -1)
+            case "neg":
+                return self.op("sub", kind, 0, x[0])
+            case "sign":
+                limited = self.arithmetic("min", dtype, x[0], 1)
+                return self.arithmetic("max", dtype, limited, -1) if _signed(dtype) else limited
+            case "abs":
+                return self.intrinsic("smax", kind, x[0], self.op("sub", kind, 0, x[0])) if _signed(dtype) else x[0]
         return self.arithmetic(name, dtype, *x)
+
+    def _shifted(self, name: str, kind: str, x: Any, by: Any) -> Value:
+        """By the width and more, and by less than none, all bits are shifted out; a shift of LLVM's is undefined there."""
+        last = 8 * BYTES[kind] - 1
+        if name == "shift_right_arithmetic":
+            return self.op("ashr", kind, x, self.intrinsic("umin", kind, by, last))
+        shifted = self.op(_SHIFTS[name], kind, x, self.op("and", kind, by, last))
+        return self.select(self.op("icmp ule", kind, by, last, result="i1"), shifted, 0, kind)
 
     def arithmetic(self, name: str, dtype: Any, *x: Any) -> Value:
         """`add`, `sub`, `mul`, `div`, `rem`, `max`, `min` and bitwise operations of real numbers."""
         dtype = np.dtype(dtype)
         kind = kind_of(dtype)
+        if kind == "i1":
+            name = _OF_TRUTH_VALUES.get(name, name)
         if name in ("max", "min"):
-            if kind == "i1":
-                return self.op("or" if name == "max" else "and", kind, *x)
             prefix = "" if dtype.kind == "f" else "s" if _signed(dtype) else "u"
             return self.intrinsic({"": name + "imum"}.get(prefix, prefix + name), kind, *x)
         if dtype.kind == "f" and name in _OF_FLOATS:
@@ -100,17 +117,16 @@ class Arithmetic(Instructions):
 
     def _quotient(self, name: str, dtype: np.dtype, kind: str, a: Any, b: Any) -> Value:
         # The processor traps at x/0 and at −2^(n−1)/−1; XLA gives −1 (x for the remainder) and the number itself (0).
-        harmless = self.select(
-            self.op("or", "i1", self.compare("eq", dtype, b, 0), self.compare("eq", dtype, b, -1)), 1, b, kind
-        ) if isinstance(b, Value) or b in (0, -1) else b  # fmt: skip
-        prefix = "s" if _signed(dtype) else "u"
-        out = self.op(f"{prefix}{name}", kind, a, harmless)
-        if harmless is b:
-            return out
-        if _signed(dtype):
-            by_minus = self.op("sub", kind, 0, a) if name == "div" else dtype.type(0)
-            out = self.select(self.compare("eq", dtype, b, -1), by_minus, out, kind)
-        return self.select(self.compare("eq", dtype, b, 0), -1 if name == "div" else a, out, kind)
+        if not isinstance(b, Value) and b not in (0, -1):
+            return self.op(f"{'s' if _signed(dtype) else 'u'}{name}", kind, a, b)
+        by_none, harmless = self.compare("eq", dtype, b, 0), b
+        by_minus = self.compare("eq", dtype, b, -1) if _signed(dtype) else None
+        for trap in (by_none, by_minus):
+            harmless = self.select(trap, 1, harmless, kind) if trap else harmless
+        out = self.op(f"{'s' if _signed(dtype) else 'u'}{name}", kind, a, harmless)
+        if by_minus:
+            out = self.select(by_minus, self.op("sub", kind, 0, a) if name == "div" else 0, out, kind)
+        return self.select(by_none, -1 if name == "div" else a, out, kind)
 
     def _of_float(self, name: str, x: list[Any], kind: str, params: Any) -> Value:
         if name in _INTRINSICS:
@@ -163,13 +179,15 @@ class Arithmetic(Instructions):
         return self.select(undefined, self.op("fadd", kind, x, y), self.select(same, y, moved, kind), kind)
 
     def convert(self, x: Any, dtype: np.dtype, to: np.dtype) -> Any:
+        if dtype == to:
+            return x
         if to.kind == "c":
             half, (real, imag) = _part(to), parts(x)
             return Complex(self.convert(real, _part(dtype), half), self.convert(imag, _part(dtype), half))
         if dtype.kind == "c":
             return self.convert(parts(x)[0], _part(dtype), to)
         if not isinstance(x, Value):
-            return to.type(x)
+            return converted(x, to)
         a, b = kind_of(dtype), kind_of(to)
         if a == b:
             return x

@@ -1,7 +1,19 @@
 """Arrays in memory, as strided views of buffers, and arrays that are yet to be computed.
 
-A buffer that nothing else refers to is updated in place. What is computed entry by entry and used once is computed where
-it is used, so that one loop does what several operations on arrays say.
+What is computed entry by entry and used once is computed where it is used, so that one loop does what several operations
+on arrays say.
+
+Who may write into whose memory, in the order in which instructions are run:
+
+1. Who reads a buffer later refers to it: each variable of a frame that holds an array, and a loop, to what it reads at
+   each turn. A buffer is written to by who made it, and then by an update (or a loop that carries it on) whose operand it
+   is, once nothing refers to it (`Places.own`). With lanes each writes to the lanes that take part only.
+2. A buffer is used for another array (`Memory.recycle`) when nothing refers to it and nothing holds it. What is read by
+   instructions that are written now and run again or later is held: what a loop carries, the operands of branches.
+3. Memory is taken before the first instruction that is run between its first and its last use is written. So it is none
+   that these have let go; only such memory may be written to in all lanes.
+
+With `always_copies` no buffer is ever used twice: what that gives, this must give to the last bit.
 """
 
 import dataclasses
@@ -18,8 +30,8 @@ SMALL = 24
 
 @dataclasses.dataclass(eq=False)
 class Buffer:
-    """Memory for numbers of one type. `references` counts the variables that hold an array that reads it, `held` says
-    that something else needs it too; `bytes` is 0 for memory that is not ours. A complex number has two `parts`: all
+    """Memory for numbers of one type. `references` counts who reads it later, `held` says that it is needed though nothing
+    may refer to it; `bytes` is 0 for memory that is not ours. A complex number has two `parts`: all
     imaginary ones come `plane` numbers after the real ones, or each after its real one where that is 0.
     """
 

@@ -1,5 +1,6 @@
 """Branches of jaxprs. With lanes a branch runs if any lane takes it, and a mask says which do."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ class Branches(Loops):
     def _cond(self, eqn: Any, args: list[Any]) -> list[Any]:
         code, (which, *operands) = self.code, args
         branches = eqn.params["branches"]
-        index = which[()]
+        index = code.entries(which)[()]
         if is_number(index):
             return self.run(branches[min(max(int(index), 0), len(branches) - 1)], operands)
         dtype, mask, last = eqn.invars[0].aval.dtype, code.mask, len(branches) - 1
@@ -30,6 +31,9 @@ class Branches(Loops):
                 here = code.compare("le" if k == 0 else "ge" if k == last else "eq", dtype, index, dtype.type(k))
             taken.append(code.op("and", "i1", mask, here) if mask is not None and here.lanes else here)
         kept = hold(operands)
+        # The end of a branch comes before the next branch, though it is written after all: what it writes to is none of
+        # the memory that a branch has used and let go.
+        outs = [Merged(self, v.aval) for v in eqn.outvars]
         lines, before = code.lines, code.block
         found, written, starts, ends = [], [], [], []
         for branch, here in zip(branches, taken, strict=True):
@@ -42,10 +46,8 @@ class Branches(Loops):
             written.append(code.lines)
             ends.append(code.block)
         code.lines, code.block, code.mask = lines, before, mask
-        outs = [
-            Merged(self, v.aval, list(values), any(here.lanes for here in taken))
-            for v, values in zip(eqn.outvars, zip(*found, strict=True), strict=True)
-        ]
+        for out, values in zip(outs, zip(*found, strict=True), strict=True):
+            out.receive(values, any(here.lanes for here in taken))
         for k, here in enumerate(taken):
             after, skipped = code.name(), code.block
             code.lines.append(f"br i1 {code.any(here).name}, label %{starts[k]}, label %{after}")
@@ -75,16 +77,20 @@ def hold(xs: list[Any]) -> list[Buffer]:
 class Merged:
     """What branches give: entries as phi nodes, large arrays in the buffer that all share or in a new one."""
 
-    def __init__(self, run: Primitives, aval: Any, values: list[Any], each: bool) -> None:
-        self.run, self.aval, self.values = run, aval, values
-        self.lanes = each or any(map(has_lanes, values))
+    def __init__(self, run: Primitives, aval: Any) -> None:
+        self.run, self.aval = run, aval
         self.kinds = [] if aval.size > SMALL else kinds_of(aval)
+        self.view: View | None = run.code.new(aval.dtype, aval.shape) if aval.size > SMALL else None
+
+    def receive(self, values: Sequence[Any], each: bool) -> None:
+        """What each branch gives, when all have been written; `each`: lanes take branches of their own."""
+        self.values = values
+        self.lanes = each or any(map(has_lanes, values))
         self.texts = ["zeroinitializer" if self.lanes else "poison"] * len(self.kinds)
-        self.view: View | None = None
-        if aval.size > SMALL:
-            first = values[0]
-            shared = all(isinstance(x, View) and x.buffer is first.buffer and x.whole for x in values)
-            self.view = first if shared else run.code.new(aval.dtype, aval.shape)
+        first = values[0]
+        if self.view and all(isinstance(x, View) and x.buffer is first.buffer and x.whole for x in values):
+            self.run.code.recycle([self.view.buffer])
+            self.view = first
 
     def deliver(self, k: int, taken: Value) -> None:
         """The end of a branch."""

@@ -48,24 +48,24 @@ def _has_kind(aval: Any) -> bool:
     return dtype == jax.dtypes.float0 or (dtype is not None and np.dtype(dtype).name in KINDS)
 
 
-def written(jaxpr: ClosedJaxpr, batched: Sequence[bool] = ()) -> str:
+def written(jaxpr: ClosedJaxpr, batched: Sequence[bool] = (), always_copies: bool = False) -> str:
     """The module whose function `{name}.kernel` computes the outputs from the inputs.
 
     With `batched` inputs the function is that of a batch: these inputs, and all outputs, have a leading axis of any
-    length. Raises `NotEntryByEntry` for what cannot be written.
+    length. `always_copies`: nothing is updated in place, and no memory used twice. Raises `NotEntryByEntry` for what cannot be written.
     """
     jaxpr = flattened(jaxpr)
     place = main_loop(jaxpr) if any(batched) else None
     if place is not None:
         with contextlib.suppress(NotEntryByEntry):
-            return _Module(jaxpr, batched).text(place)
-    return _Module(jaxpr, batched).text(None)
+            return _Module(jaxpr, batched, always_copies).text(place)
+    return _Module(jaxpr, batched, always_copies).text(None)
 
 
 class _Module:
-    def __init__(self, jaxpr: ClosedJaxpr, batched: Sequence[bool]) -> None:
+    def __init__(self, jaxpr: ClosedJaxpr, batched: Sequence[bool], always_copies: bool) -> None:
         self.jaxpr, self.batched = jaxpr, list(batched) or [False] * len(jaxpr.jaxpr.invars)
-        self.code = Memory(machine.vector_size() if any(batched) else 1)
+        self.code = Memory(machine.vector_size() if any(batched) else 1, always_copies)
         self.run = Control(self.code, LIMIT)
 
     def text(self, place: int | None) -> str:
@@ -157,9 +157,11 @@ class _Module:
         code.label(done)
 
 
-def compiled(jaxpr: ClosedJaxpr, batched: Sequence[bool] = ()) -> Callable[..., list[Any]]:
+def compiled(
+    jaxpr: ClosedJaxpr, batched: Sequence[bool] = (), always_copies: bool = False
+) -> Callable[..., list[Any]]:
     """The function as one that JAX calls; arguments and results as `written` has them."""
-    name = machine.register(written(jaxpr, batched))
+    name = machine.register(written(jaxpr, batched, always_copies))
     first = list(batched).index(True) if any(batched) else None
 
     def call(*xs: Any) -> list[Any]:

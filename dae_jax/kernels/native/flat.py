@@ -4,7 +4,8 @@ from collections.abc import Hashable, Sequence
 from typing import Any
 
 import jax
-from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var
+import jax.numpy as jnp
+from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
 
 from ..entries import CALLS as OF_CALLS
 
@@ -66,10 +67,12 @@ class _Flat:
         if name in _BY_OTHERS:
             scalar = name != "maybe_set" and not args[0].aval.ndim
             return args[:1] if scalar else self.run(_meaning(eqn), args)
+        if name == "while" and eqn.params["cond_jaxpr"].out_avals[0].shape:
+            eqn, args = _until_all_are_done(eqn, args)
         if name in _SAME_IF_SO_SHAPED and _like(args[0].aval, eqn.outvars[0].aval):
             return args[:1]
         atoms = [_atom(x) for x in args]
-        key = (name, _key(p), frozenset(atoms) if name in _COMMUTATIVE else tuple(atoms))
+        key = (name, _key(eqn.params), frozenset(atoms) if name in _COMMUTATIVE else tuple(atoms))
         found = None if eqn.effects or key[1] is None else self._known.get(key)
         if found is None:
             found = self._known[key] = [Var(v.aval) for v in eqn.outvars]
@@ -81,6 +84,31 @@ def of_solve(p: Any, args: list[Any]) -> list[Any]:
     """The operands of a `custom_linear_solve` that the function which finds the solution takes."""
     start, count = sum(p["const_lengths"][:2]), p["const_lengths"].solve
     return args[start : start + count] + args[sum(p["const_lengths"]) :]
+
+
+def _until_all_are_done(eqn: JaxprEqn, args: list[Any]) -> tuple[JaxprEqn, list[Any]]:
+    """A loop with a condition for each of several elements, as `vmap` makes it: what is done stays as it is."""
+    p = eqn.params
+    n, m = p["cond_nconsts"], p["body_nconsts"]
+    condition, body = map(jaxpr_as_fun, (p["cond_jaxpr"], p["body_jaxpr"]))
+
+    def any_goes_on(*xs: Any) -> Any:
+        return jnp.any(condition(*xs)[0])
+
+    def turn(*xs: Any) -> list[Any]:
+        carry = xs[n + m :]
+        (goes_on,) = condition(*xs[:n], *carry)
+        here = lambda x: jax.lax.broadcast_in_dim(goes_on, x.shape, range(goes_on.ndim))
+        return [jax.lax.select(here(x), y, x) for x, y in zip(carry, body(*xs[n:]), strict=True)]
+
+    structs = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in args]
+    params = {
+        **p,
+        "cond_jaxpr": jax.make_jaxpr(any_goes_on)(*structs[:n], *structs[n + m :]),
+        "body_jaxpr": jax.make_jaxpr(turn)(*structs),
+        "body_nconsts": n + m,
+    }
+    return eqn.replace(params=params), [*args[:n], *args]
 
 
 def _like(a: Any, b: Any) -> bool:

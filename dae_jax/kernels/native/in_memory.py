@@ -25,13 +25,15 @@ MORE_ELEMENTWISE = frozenset("shift_left shift_right_logical shift_right_arithme
 class InMemory(Places):
     """Writes loops over the entries of large arrays."""
 
-    def combined(self, name: str, a: Any, b: Any) -> Any:
+    def combined(self, name: str, dtype: Any, a: Any, b: Any) -> Any:
+        """Two entries of a type by `add`, `mul`, `max`, `min`, `and` or `or`."""
         if is_number(a) and is_number(b):
-            return _FOLDED[name](a, b)
+            with np.errstate(all="ignore"):
+                return _FOLDED[name](a, b)
         if isinstance(a, Complex) or isinstance(b, Complex):
             kind = next(p.kind for x in (a, b) for p in parts(x) if isinstance(p, Value))
             return self.code.of_complex(name, (a, b), kind)
-        return self.code.arithmetic(name, _dtype(a if isinstance(a, Value) else b), a, b)
+        return self.code.arithmetic(name, dtype, a, b)
 
     def in_memory(self, eqn: Any, args: list[Any]) -> list[Any]:
         name, out = eqn.primitive.name, eqn.outvars[0].aval
@@ -48,7 +50,7 @@ class InMemory(Places):
             return [self._entry_by_entry(out, one, [self._operand(*a, out) for a in zip(args, dtypes, strict=True)])]
         if name == "iota":
             dimension, to = eqn.params["dimension"], np.dtype(out.dtype)
-            number = lambda i: to.type(i) if isinstance(i, int) else self.code.convert(i, np.dtype("int64"), to)
+            number = lambda i: self.code.convert(np.int64(i) if isinstance(i, int) else i, np.dtype("int64"), to)
             return [Deferred(to, out.shape, lambda index: number(index[dimension]), ())]
         args = [
             self.code.memory(a, d) if isinstance(a, np.ndarray) and a.ndim else a
@@ -104,7 +106,7 @@ class InMemory(Places):
             return code.entry(x, index)
 
         if math.prod(extents) <= SMALL:
-            combine = functools.partial(self.combined, name)
+            combine = functools.partial(self.combined, name, dtype)
             read = lambda at: in_pairs(combine, [entry(at, of) for of in np.ndindex(*extents)] or [first])
             return Deferred(dtype, tuple(out.shape), read, x.buffers, depth=getattr(x, "depth", 0) + 1)
         if not kept and flat:
@@ -117,7 +119,8 @@ class InMemory(Places):
 
         def add(index: list[Any]) -> None:
             place = code.at(result, [index[d] for d in kept])
-            code.store(result.buffer, place, self.combined(name, code.load(result.buffer, place), code.entry(x, index)))
+            found = self.combined(name, dtype, code.load(result.buffer, place), code.entry(x, index))
+            code.store(result.buffer, place, found)
 
         with code.unmasked():
             code.for_each(x.shape, add)
@@ -199,7 +202,8 @@ class InMemory(Places):
         free_a = [d for d in range(a.ndim) if d not in (*of_a, *batch_a)]
         free_b = [d for d in range(b.ndim) if d not in (*of_b, *batch_b)]
         n, m = len(batch_a), len(free_a)
-        extents, zero = [a.shape[d] for d in of_a], np.dtype(out.dtype).type(0)
+        extents, dtype = [a.shape[d] for d in of_a], np.dtype(out.dtype)
+        zero, number = dtype.type(0), lambda x, of: self.code.convert(x, of.dtype, dtype)
 
         def term(index: Sequence[Any], inner: Sequence[Any]) -> Any:
             i: list[Any] = [0] * a.ndim
@@ -210,13 +214,13 @@ class InMemory(Places):
             for dims, values in ((batch_b, index[:n]), (free_b, index[n + m :]), (of_b, inner)):
                 for d, value in zip(dims, values, strict=True):
                     j[d] = value
-            return self.combined("mul", code.entry(a, i), code.entry(b, j))
+            return self.combined("mul", dtype, number(code.entry(a, i), a), number(code.entry(b, j), b))
 
         if math.prod(extents) <= SMALL:
-            plus = functools.partial(self.combined, "add")
+            plus = functools.partial(self.combined, "add", dtype)
             entry = lambda index: in_pairs(plus, [term(index, of) for of in np.ndindex(*extents)] or [zero])
         else:
-            entry = lambda index: self._total("add", zero.dtype, extents, zero, functools.partial(term, index))
+            entry = lambda index: self._total("add", dtype, extents, zero, functools.partial(term, index))
         return code.made(out.dtype, out.shape, entry)
 
 
@@ -231,21 +235,13 @@ def identity(name: str, dtype: np.dtype) -> Any:
     if name in ("add", "or"):
         return dtype.type(0)
     if name in ("mul", "and"):
-        return dtype.type(1) if name == "mul" or dtype.kind == "b" else dtype.type(-1)
+        return dtype.type(1) if name == "mul" else ~dtype.type(0)
+    if dtype.kind == "b":
+        return dtype.type(name == "min")
     if dtype.kind == "f":
         return dtype.type(-np.inf if name == "max" else np.inf)
     info = np.iinfo(dtype)
     return dtype.type(info.min if name == "max" else info.max)
-
-
-_DTYPES = {"double": "float64", "float": "float32", "i1": "bool", "i32": "int32", "i64": "int64"}
-
-
-def _dtype(x: Value) -> np.dtype:
-    """The type of what is added up: floats, truth values and signed integers."""
-    if x.kind not in _DTYPES:
-        raise NotEntryByEntry(x.kind)
-    return np.dtype(_DTYPES[x.kind])
 
 
 def in_pairs(combine: Callable[[Any, Any], Any], terms: list[Any]) -> Any:

@@ -47,7 +47,7 @@ class Loops(Primitives):
         (goes_on,) = self.run(p["cond_jaxpr"], [*of_cond, *carry.values])
         for x in carry.values:
             refer(x, -1)
-        more = code.copy(goes_on[()], "i1")
+        more = code.copy(code.entries(goes_on)[()], "i1")
         each = any(own) and more.lanes
         if each:
             code.mask = code.op("and", "i1", more, Value(f"%{active}", "i1", True))
@@ -77,9 +77,9 @@ class Loops(Primitives):
         total = length * (1 + sum(1 for _ in equations(inner)))
         if (total <= WRITTEN_OUT and all(y.size <= LARGE for y in of_ys)) or length <= 1:
             return self._written_out(inner, consts, first, list(map(code.entries, xs)), length, p["reverse"], of_ys)
-        for x in (*consts, *xs):
-            refer(x, 1)
         rows = [code.memory(x, v.aval.dtype) for x, v in zip(xs, eqn.invars[n + m :], strict=True)]
+        for x in (*consts, *rows):
+            refer(x, 1)
         ys = [code.new(a.dtype, a.shape) for a in of_ys]
         own = ()
         if code.width > 1:
@@ -93,7 +93,7 @@ class Loops(Primitives):
             for y, value in zip(ys, out[m:], strict=True):
                 code.assign(code.row(y, at), value, fresh=True)
             phis += carry.turn(out[:m], entered, None)
-        for x in (*consts, *xs):
+        for x in (*consts, *rows):
             refer(x, -1)
         return [*carry.values, *ys]
 

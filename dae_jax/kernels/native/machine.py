@@ -57,6 +57,11 @@ call:
 _DATA_OF_BUFFER = 24
 _DIMENSIONS_OF_BUFFER = 40
 
+# Of LLVM's passes. Without the vectorisation of straight-line code: it gains nothing here, and LLVM 22.1 breaks some
+# functions by it; with that of loops.
+_SPEED = 2
+_BY_VECTORS = (False, True)
+
 _lock = threading.Lock()
 _engines: dict[str, Any] = {}
 
@@ -248,16 +253,15 @@ def _object_code(text: str) -> bytes:
         with contextlib.suppress(OSError):
             return kept.read_bytes()
     machine, llvm = host(), _llvm()
-    # Without the vectorisation of straight-line code: it gains nothing here, and LLVM 22.1 breaks some functions by it.
-    tuning = llvm.create_pipeline_tuning_options(speed_level=2)
-    tuning.slp_vectorization = False
-    tuning.loop_vectorization = True
+    tuning = llvm.create_pipeline_tuning_options(speed_level=_SPEED)
+    tuning.slp_vectorization, tuning.loop_vectorization = _BY_VECTORS
     passes = llvm.create_pass_builder(machine, tuning)
     try:
         module = llvm.parse_assembly(text)
-        passes.getModulePassManager().run(module, passes)
+        # The passes end the process where a module is broken.
         module.verify()
-    except RuntimeError as error:  # what LLVM would end the process for
+        passes.getModulePassManager().run(module, passes)
+    except RuntimeError as error:
         raise NotEntryByEntry(f"LLVM: {error}") from error
     code = machine.emit_object(module)
     if kept is not None:
@@ -275,5 +279,5 @@ def _cached(text: str) -> Path | None:
         return None
     llvm = _llvm()
     features = llvm.get_host_cpu_features().flatten()
-    made_for = f"{llvm.llvm_version_info} {llvm.get_host_cpu_name()} {features} {text}"
+    made_for = f"{llvm.llvm_version_info} {llvm.get_host_cpu_name()} {features} {_SPEED} {_BY_VECTORS} {text}"
     return Path(folder) / f"dae_jax-{hashlib.sha256(made_for.encode()).hexdigest()}.o"

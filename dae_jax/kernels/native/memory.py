@@ -26,15 +26,16 @@ WRITTEN_OUT = 4
 class Memory(Arithmetic):
     """Instructions with arrays in memory."""
 
-    def __init__(self, width: int = 1) -> None:
+    def __init__(self, width: int = 1, always_copies: bool = False) -> None:
         super().__init__(width)
+        self.always_copies = always_copies
         self.mask: Value | None = None
         # What is in memory stays there, unless it has fewer entries; with lanes each of them is a vector.
         self.few = 8 if width == 1 else SMALL
         self.stack: list[str] = []
         self.heap = 0
         self.free: dict[int, list[str]] = {}
-        self.recycles = True
+        self.recycles = not always_copies
         self.longest = 0
         self.constants: list[str] = []
 

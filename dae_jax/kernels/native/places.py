@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from ..entries import EntryByEntry, is_number, objects
+from ..entries import EntryByEntry, as_indices, is_number, objects
 from ..gathers import gathered, windows
 from .arrays import Deferred, View, row_major, shared
 from .instructions import Value
@@ -106,13 +106,14 @@ class Places(EntryByEntry):
             elif n == size:
                 out.append(0)
             else:
-                i = code.convert(i, np.dtype(v.aval.dtype), np.dtype("int64"))
+                i = self._index(i, np.dtype(v.aval.dtype))
                 out.append(code.intrinsic("smax", "i64", code.intrinsic("smin", "i64", i, n - size), 0))
         return out
 
     def own(self, x: Any, dtype: Any) -> View:
         """The array if nothing else refers to it, else a copy."""
-        if isinstance(x, View) and x.buffer.writable and not x.buffer.references and x.whole:
+        copies = self.code.always_copies
+        if isinstance(x, View) and x.buffer.writable and not x.buffer.references and x.whole and not copies:
             return x
         return self.code.copied(x, dtype)
 
@@ -135,7 +136,7 @@ class Places(EntryByEntry):
         def put(index: list[Any], x: Any) -> None:
             at, inside = place(index)
             if eqn.primitive.name == "scatter-add":
-                x = self.combined("add", code.load(out.buffer, at), x)
+                x = self.combined("add", dtype, code.load(out.buffer, at), x)
             if inside is not None:
                 x = code.select(inside, x, code.load(out.buffer, at), out.buffer.kind)
             code.store(out.buffer, at, x)
@@ -154,9 +155,14 @@ class Places(EntryByEntry):
 
         def read(index: list[Any]) -> Any:
             i = self.code.entry(indices, index)
-            return int(i) if is_number(i) else self.code.convert(i, dtype, np.dtype("int64"))
+            return int(i) if is_number(i) else self._index(i, dtype)
 
         return read
+
+    def _index(self, i: Value, dtype: np.dtype) -> Value:
+        """As an integer of 64 bits; what is too large for one is the largest."""
+        i = self.code.intrinsic("umin", "i64", i, np.iinfo(np.int64).max) if dtype == np.uint64 else i
+        return self.code.convert(i, dtype, np.dtype("int64"))
 
     def _places(
         self, x: View, read: Callable[[list[Any]], Any], numbers: Any, sizes: Any, mode: Any
@@ -195,7 +201,7 @@ class Places(EntryByEntry):
         dtype = np.dtype(out.dtype)
         fill = dtype.type(_fill(dtype) if p["fill_value"] is None else p["fill_value"])
         if isinstance(args[1], np.ndarray) and all(map(is_number, args[1].ravel())):
-            return self._gathered(x, args[1].astype(int), p, out, fill)
+            return self._gathered(x, as_indices(args[1]), p, out, fill)
         place = self._places(
             x, self._indices(eqn, args[1], out.size > code.few), p["dimension_numbers"], p["slice_sizes"], p["mode"]
         )

@@ -7,10 +7,11 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from ..entries import ELEMENTWISE, STRUCTURAL, NotEntryByEntry, is_number, objects
+from ..entries import ELEMENTWISE, STRUCTURAL, NotEntryByEntry, columns, is_number, objects
 from ..numbers import on_numbers
 from .flat import flattened
 from .in_memory import FOLDS, LARGE, MORE_ELEMENTWISE, InMemory, identity, in_pairs
+from .instructions import KINDS, Value, parts
 from .memory import Memory
 
 
@@ -20,6 +21,7 @@ _MOVES = frozenset(
     "broadcast_in_dim concatenate expand_dims iota pad reshape rev slice split squeeze stack transpose unstack".split()
 )
 _CUMULATIVE = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}
+_OF_KIND = {kind: name for name, kind in KINDS.items() if not name.startswith("u")}
 SIMPLE = (
     (ELEMENTWISE - {"digamma", "erf_inv", "lgamma"})
     | STRUCTURAL
@@ -56,13 +58,10 @@ class Primitives(InMemory):
         return super().scalar(eqn, x)
 
     def product(self, a: Any, b: Any) -> Any:
-        return self.combined("mul", a, b)
+        return self.combined("mul", _of_any_sign(a, b), a, b)
 
     def total(self, a: Any, b: Any) -> Any:
-        return b if is_number(a, 0) else a if is_number(b, 0) else self.combined("add", a, b)
-
-    def larger(self, a: Any, b: Any) -> Any:
-        return b if is_number(a, -np.inf) else self.combined("max", a, b)
+        return b if is_number(a, 0) else a if is_number(b, 0) else self.combined("add", _of_any_sign(a, b), a, b)
 
     def constant(self, x: Any) -> Any:
         if isinstance(x, jax.core.Tracer):
@@ -104,6 +103,11 @@ class Primitives(InMemory):
             raise NotEntryByEntry(name)
         return super().equation(eqn, args)
 
+    def dot_general(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
+        to = np.dtype(eqn.outvars[0].aval.dtype)
+        convert = lambda x, v: objects([self.code.convert(e, np.dtype(v.aval.dtype), to) for e in x.ravel()], x.shape)
+        return super().dot_general(eqn, list(map(convert, args, eqn.invars)))
+
     def add_any(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
         if np.dtype(eqn.outvars[0].aval.dtype).kind != "c":
             return super().add_any(eqn, args)
@@ -119,20 +123,18 @@ class Primitives(InMemory):
         return out
 
     def _folded(self, eqn: Any, x: np.ndarray) -> np.ndarray:
-        axes, dtype = eqn.params["axes"], np.dtype(eqn.outvars[0].aval.dtype)
-        x = np.moveaxis(x, axes, range(len(axes))).reshape((-1, *eqn.outvars[0].aval.shape))
-        combine = functools.partial(self.combined, FOLDS[eqn.primitive.name])
-        columns = [list(x[(slice(None), *i)]) for i in np.ndindex(x.shape[1:])]
-        if not x.shape[0]:
-            columns = [[identity(FOLDS[eqn.primitive.name], dtype)]] * len(columns)
-        return objects([in_pairs(combine, column) for column in columns], x.shape[1:])
+        x, dtype = columns(x, eqn.params["axes"]), np.dtype(eqn.outvars[0].aval.dtype)
+        combine = functools.partial(self.combined, FOLDS[eqn.primitive.name], dtype)
+        first = [] if x.shape[0] else [identity(FOLDS[eqn.primitive.name], dtype)]
+        return objects([in_pairs(combine, [*x[(slice(None), *i)], *first]) for i in np.ndindex(x.shape[1:])], x.shape[1:])
 
     def _accumulated(self, eqn: Any, x: np.ndarray) -> np.ndarray:
+        combine = functools.partial(self.combined, _CUMULATIVE[eqn.primitive.name], eqn.outvars[0].aval.dtype)
         out = np.moveaxis(x.copy(), eqn.params["axis"], 0)
         out = out[::-1] if eqn.params["reverse"] else out
         for i in range(1, len(out)):
             for j in np.ndindex(out.shape[1:]):
-                out[(i, *j)] = self.combined(_CUMULATIVE[eqn.primitive.name], out[(i - 1, *j)], out[(i, *j)])
+                out[(i, *j)] = combine(out[(i - 1, *j)], out[(i, *j)])
         return np.moveaxis(out[::-1] if eqn.params["reverse"] else out, 0, eqn.params["axis"])
 
     def _extreme(self, eqn: Any, x: np.ndarray) -> np.ndarray:
@@ -144,6 +146,12 @@ class Primitives(InMemory):
             for j in np.ndindex(moved.shape[1:])
         ]
         return objects([place for _, place in found], moved.shape[1:])
+
+
+def _of_any_sign(*x: Any) -> np.dtype:
+    """The type of numbers that are added or multiplied, signed where they are integers: both come to the same."""
+    kinds = [p.kind for e in x for p in parts(e) if isinstance(p, Value)]
+    return np.dtype(_OF_KIND[kinds[0]] if kinds else x[0].dtype)
 
 
 def _stays_known(eqn: Any, args: list[Any]) -> bool:

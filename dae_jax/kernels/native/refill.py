@@ -91,7 +91,7 @@ class Refilled:
             (goes_on,) = self.run.run(p["cond_jaxpr"], [*consts[:n], *self.carry])
             for x in self.carry:
                 refer(x, -1)
-            going = code.op("and", "i1", alive, code.in_lanes(code.copy(goes_on[()], "i1")))
+            going = code.op("and", "i1", alive, code.in_lanes(code.copy(code.entries(goes_on)[()], "i1")))
             code.lines.append(f"{self.free.name} = xor {code.type('i1', True)} {going.name}, splat (i1 true)")
             finished = code.op("and", "i1", alive, self.free)
             bits = code.cast("bitcast", finished, f"i{code.width}", True)
