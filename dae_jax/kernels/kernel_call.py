@@ -31,14 +31,15 @@ def hindrances(jaxpr: ClosedJaxpr) -> tuple[str, ...]:
 
 def called(jaxpr: ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
     """The results of a traced function, as one kernel where it can be one."""
-    constants = [x for x in jaxpr.consts if isinstance(x, jax.core.Tracer)]
-    if hindrances(jaxpr) or jaxpr.effects or constants:
-        return jax.jit(jaxpr_as_fun(jaxpr))(*args)
     # Tangents of integers are no numbers. XLA aborts where a parameter of a kernel is not used.
     outvars = jaxpr.jaxpr.outvars
     known = [v.aval.dtype != jax.dtypes.float0 for v in outvars]
     needed, used = dce_jaxpr(jaxpr.jaxpr, known)
-    numbers = iter(_bind(ClosedJaxpr(needed, jaxpr.consts), (), [x for x, u in zip(args, used, strict=True) if u]))
+    kernel = ClosedJaxpr(needed, jaxpr.consts)
+    constants = [x for x in jaxpr.consts if isinstance(x, jax.core.Tracer)]
+    if jaxpr.effects or constants or hindrances(kernel):
+        return jax.jit(jaxpr_as_fun(jaxpr))(*args)
+    numbers = iter(_bind(kernel, (), [x for x, u in zip(args, used, strict=True) if u]))
     return [
         next(numbers) if k else np.zeros(v.aval.shape, jax.dtypes.float0) for v, k in zip(outvars, known, strict=True)
     ]
