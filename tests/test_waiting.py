@@ -1,10 +1,16 @@
 """What keeps the first answer from being waited for: what is compiled, by whom, and that it is said."""
 
+import sys
+from typing import ClassVar
+
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
-from dae_jax.kernels import xla_kernel
+import dae_jax
+from dae_jax.kernels import waiting, xla_kernel
 from dae_jax.kernels.native import compiled, compiler, hindrances, machine
 from dae_jax.kernels.native.extent import extent
 
@@ -51,3 +57,99 @@ class TestCheaperForms:
         monkeypatch.setattr(xla_kernel, "LIMIT", 30)
         assert xla_kernel.hindrances(jaxpr) == ("size",)
         assert not xla_kernel.qualifies(jaxpr)
+
+
+class Clock:
+    """In place of `threading.Timer`: nothing happens before `pass_by`."""
+
+    timers: ClassVar[list["Clock"]] = []
+
+    def __init__(self, delay, action):
+        self.delay, self.action, self.done = delay, action, False
+        Clock.timers.append(self)
+
+    def start(self):
+        self.started = True
+
+    def cancel(self):
+        self.done = True
+
+    @classmethod
+    def pass_by(cls, seconds):
+        for timer in cls.timers:
+            if timer.started and not timer.done and timer.delay <= seconds:
+                timer.action()
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    Clock.timers = []
+    monkeypatch.setattr(waiting.threading, "Timer", Clock)
+    return Clock
+
+
+def solved(late=0.0, **options):
+    """A solve that nothing has compiled before; `late`: how much time passes by meanwhile."""
+
+    def force(t, q, v, args):
+        Clock.pass_by(late)
+        return jnp.array([0.0, 9.81])
+
+    system = dae_jax.ConstrainedSystem(force, lambda t, q, args: (q @ q - 1) / 2)
+    start = jnp.array([1.0, 0.0]), jnp.zeros(2)
+    solve = lambda: dae_jax.daesolve(system, diffrax.Euler(), 0.0, 0.1, 0.1, start, **options)
+    return solve(), solve()
+
+
+SYSTEM = dae_jax.ConstrainedSystem(lambda t, q, v, args: jnp.array([0.0, 9.81]), lambda t, q, args: (q @ q - 1) / 2)
+
+
+class TestNotice:
+    LINE = "dae_jax: compiling …\n"
+
+    def test_after_two_seconds_on_a_terminal(self, clock, capsys, monkeypatch):
+        monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+        solved(late=1.9)
+        assert capsys.readouterr().err == ""
+        solved(late=2.1)
+        assert self.LINE in capsys.readouterr().err
+        clock.pass_by(100.0)
+        assert capsys.readouterr().err == "", "no line once it is compiled"
+
+    def test_not_where_nobody_looks(self, clock, capsys):
+        solved(late=100.0)
+        assert capsys.readouterr().err == ""
+
+    def test_where_a_progress_meter_is_asked_for(self, clock, capsys):
+        meter = diffrax.TextProgressMeter()
+        solved(late=100.0, progress_meter=meter)
+        assert self.LINE in capsys.readouterr().err
+
+    def test_an_error_ends_the_wait(self, clock, capsys, monkeypatch):
+        monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+        waits = []
+
+        def refuse(*_):
+            waits.append(len(clock.timers))
+            raise ArithmeticError("no force")
+
+        system = dae_jax.ConstrainedSystem(refuse, lambda t, q, args: (q @ q - 1) / 2)
+        with pytest.raises(ArithmeticError):
+            dae_jax.daesolve(system, diffrax.Euler(), 0.0, 0.1, 0.1, (jnp.array([1.0, 0.0]), jnp.zeros(2)))
+        clock.pass_by(100.0)
+        assert waits
+        assert capsys.readouterr().err == ""
+
+
+def test_stats_tell_the_time_to_compile():
+    first, second = solved()
+    assert first.stats["compile_seconds"] > 0
+    assert second.stats["compile_seconds"] == 0
+
+
+def test_inside_jit_there_is_no_time_to_tell():
+    def end():
+        sol = dae_jax.daesolve(SYSTEM, diffrax.Euler(), 0.0, 0.1, 0.1, (jnp.array([1.0, 0.0]), jnp.zeros(2)))
+        return sol.stats
+
+    assert "compile_seconds" not in jax.jit(end)()

@@ -15,7 +15,7 @@ from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import batching, mlir
 from jax.interpreters.partial_eval import dce_jaxpr
 
-from . import native, xla_kernel
+from . import native, waiting, xla_kernel
 from .entries import NotEntryByEntry
 
 
@@ -61,6 +61,15 @@ def _(*args: Any, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> Any:
 
 
 def _lower(*args: Any, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> list[Any]:
+    began = waiting.begin()
+    try:
+        return _lowered(args, jaxpr, lanes)
+    finally:
+        if began:
+            waiting.end()
+
+
+def _lowered(args: Any, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> list[Any]:
     if not native.hindrances(jaxpr):
         try:
             return native.compiled(jaxpr, lanes)(*args)
