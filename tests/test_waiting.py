@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 
 import dae_jax
-from dae_jax.kernels import waiting, xla_kernel
+from dae_jax import scenes
+from dae_jax.kernels import waiting, without_checks, xla_kernel
 from dae_jax.kernels.native import compiled, compiler, hindrances, machine
+from dae_jax.kernels.native.arrays import SMALL
 from dae_jax.kernels.native.extent import extent
+from dae_jax.solve import prepared
 
 
 X = np.array([1.0, 2.0, -3.0])
@@ -153,3 +156,16 @@ def test_inside_jit_there_is_no_time_to_tell():
         return sol.stats
 
     assert "compile_seconds" not in jax.jit(end)()
+
+
+def test_dummy_derivatives_of_a_mechanism_are_not_left_to_xla():
+    """The double pendulum: estimated at more than is allowed, half of it zeros, with factorials in it."""
+    scene = scenes.double_pendulum()
+    solve, *inputs = prepared(
+        scene.system, diffrax.Tsit5(), 0.0, 1.0, None, scene.y0, None, dae_jax.DummyDerivatives(),
+        diffrax.SaveAt(t1=True), None, diffrax.RecursiveCheckpointAdjoint(), None, 4096, diffrax.NoProgressMeter(),
+    )  # fmt: skip
+    kernel, arrays = solve.kernel(*inputs, None)
+    jaxpr = jax.make_jaxpr(without_checks(kernel))(arrays)
+    assert extent(jaxpr, [v.aval.size > SMALL for v in jaxpr.jaxpr.invars])[0] > compiler.LIMIT
+    assert hindrances(jaxpr) == ()
