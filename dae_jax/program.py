@@ -16,7 +16,7 @@ from .checks import is_saved_part, saved_parts
 from .formulations import AbstractFormulation, Residual
 from .initialise import look_at_end, look_at_start
 from .jumps import Jump, refuse_wrong_event, solve_with_jumps
-from .kernels import PullBack, inexact, one_kernel, one_kernel_enabled
+from .kernels import PullBack, inexact, one_kernel, one_kernel_enabled, waiting
 from .linalg import rms_norm
 from .normals import Rank
 from .regularity import COARSE
@@ -83,6 +83,7 @@ class _Split(eqx.Module):
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def _jitted(program: Program, rank: int | Rank | None, arrays: list[Any]) -> Any:
     solve, *inputs = program.inputs(jax.tree.map(jnp.asarray, arrays))
+    waiting.begin(always=not isinstance(solve.progress_meter, diffrax.NoProgressMeter))
     solve.refuse_wrong_functions(*inputs)
     sol, as_expected = (
         (solve_with_jumps(solve, *inputs, rank)) if isinstance(solve.event, Jump) else solve(*inputs, rank)
@@ -97,10 +98,13 @@ def _numbers(program: Program, rank: int | Rank | None, arrays: list[Any]) -> _S
     return _Split.of(solve._diffeqsolve(*inputs, rank))
 
 
-def run(program: Program, rank: int | Rank | None, arrays: list[Any]) -> tuple[DAESolution, Any]:
-    """The solution, and whether the start was consistent and of the given rank."""
-    sol, as_expected = _jitted(program, rank, arrays)
-    return sol.whole(), as_expected
+def run(program: Program, rank: int | Rank | None, arrays: list[Any]) -> tuple[DAESolution, Any, float]:
+    """The solution, whether the start was consistent and of the given rank, and the seconds spent on compiling this."""
+    try:
+        sol, as_expected = _jitted(program, rank, arrays)
+    finally:
+        seconds = waiting.end()
+    return sol.whole(), as_expected, seconds
 
 
 class _Decode(eqx.Module):

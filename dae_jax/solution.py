@@ -99,7 +99,9 @@ class DAESolution(eqx.Module):
     - `t0`, `t1`: the interval.
     - `ts`: the saved times; `ys`: the saved states, with the structure of `y0` (or of what `SaveAt(fn=...)` returns).
     - `interpolation`: with `SaveAt(dense=True)`, the solution at any time; `sol.evaluate(t)` for short.
-    - `stats`: counts of steps; `stats["end_time"]`: the time at which the solve ended.
+    - `stats`: counts of steps; `stats["end_time"]`: the time at which the solve ended; of a solve outside `jit`, `vmap` and
+      `grad` also "compile_seconds", the time that it took to trace and compile it and to run it for the first time, 0 where it
+      was compiled already.
     - `result`: a `RESULTS` code, with its message.
     - `event_mask`: which event ended the solve, if any.
     - `rank`: how many constraints are independent, where some are redundant, else `None`.

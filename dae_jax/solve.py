@@ -80,7 +80,7 @@ def daesolve(
     )  # fmt: skip
     program, arrays = split(inputs)
     if any(isinstance(x, jax.core.Tracer) for x in arrays):
-        sol, _ = run(program, getattr(system, "rank", None), arrays)
+        sol, *_ = run(program, getattr(system, "rank", None), arrays)
     else:
         sol = _run_on_numbers(program, arrays, inputs)
     return _raise_if_failed(sol, inputs) if throw else sol
@@ -155,13 +155,17 @@ def _run_on_numbers(program: Program, arrays: list[Any], inputs: Any) -> DAESolu
     solve, system, t0, t1, _, y0, args = inputs
     refuse_bad_times(solve.saveat, t0, t1)
     rank = _ranks.get(program, getattr(system, "rank", None))
-    sol, as_expected = run(program, rank, arrays)
+    sol, as_expected, seconds = run(program, rank, arrays)
     # Inside an outer `jit` the result is no number, although the inputs are: they are looked at each time it is traced.
-    if isinstance(as_expected, jax.core.Tracer) or not as_expected:
+    inside = isinstance(as_expected, jax.core.Tracer)
+    if inside or not as_expected:
         with jax.ensure_compile_time_eval():
             _ranks[program] = refuse_bad_start(system, t0, y0, args, solve.formulation.inverts_mass)
         if _ranks[program] != rank:
-            sol, _ = run(program, _ranks[program], arrays)
+            sol, _, more = run(program, _ranks[program], arrays)
+            seconds += more
+    if not inside:
+        sol.stats["compile_seconds"] = seconds
     return sol
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from dae_jax.kernels import kernel_call, one_kernel
 from dae_jax.kernels.entries import NotEntryByEntry
-from dae_jax.kernels.native import compiled, hindrances, machine
+from dae_jax.kernels.native import compiled, compiler, hindrances, machine
 from dae_jax.kernels.native.compiler import written
 from dae_jax.kernels.native.flat import flattened
 from dae_jax.kernels.native.machine import vector_size
@@ -260,15 +260,16 @@ def test_hindrances(fn, name):
     jaxpr = jax.make_jaxpr(fn)(X)
     assert name in hindrances(jaxpr)
     with pytest.raises((NotEntryByEntry, KeyError)):
-        written(jaxpr)
+        written(jaxpr, ())
 
 
-def test_too_large():
+def test_too_large(monkeypatch):
     def fn(x):
-        for _ in range(2000):
+        for _ in range(200):
             x = jnp.sin(x) + x[::-1]
         return x
 
+    monkeypatch.setattr(compiler, "LIMIT", 1000)
     assert hindrances(jax.make_jaxpr(fn)(jnp.arange(100.0))) == ("size",)
 
 

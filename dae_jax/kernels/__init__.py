@@ -1,5 +1,6 @@
 """How small functions become fast machine code: scalar arithmetic and single kernels."""
 
+from . import waiting as waiting
 from .gathers import gathered as gathered, windows as windows
 from .jaxprs import equations as equations, is_large as is_large
 from .kernel_call import hindrances as hindrances

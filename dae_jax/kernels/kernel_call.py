@@ -15,7 +15,7 @@ from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import batching, mlir
 from jax.interpreters.partial_eval import dce_jaxpr
 
-from . import native, xla_kernel
+from . import native, waiting, xla_kernel
 from .entries import NotEntryByEntry
 from .unchecked import without_checks
 
@@ -55,14 +55,15 @@ def _traced(fn: Callable[..., Any], shapes: Any) -> tuple[ClosedJaxpr, Any]:
 
 def called(jaxpr: ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
     """The results of a traced function, as one kernel where it can be one."""
-    constants = [x for x in jaxpr.consts if isinstance(x, jax.core.Tracer)]
-    if hindrances(jaxpr) or jaxpr.effects or constants:
-        return jax.jit(jaxpr_as_fun(jaxpr))(*args)
     # Tangents of integers are no numbers. XLA aborts where a parameter of a kernel is not used.
     outvars = jaxpr.jaxpr.outvars
     known = [v.aval.dtype != jax.dtypes.float0 for v in outvars]
     needed, used = dce_jaxpr(jaxpr.jaxpr, known)
-    numbers = iter(_bind(ClosedJaxpr(needed, jaxpr.consts), (), [x for x, u in zip(args, used, strict=True) if u]))
+    kernel = ClosedJaxpr(needed, jaxpr.consts)
+    constants = [x for x in jaxpr.consts if isinstance(x, jax.core.Tracer)]
+    if jaxpr.effects or constants or hindrances(kernel):
+        return jax.jit(jaxpr_as_fun(jaxpr))(*args)
+    numbers = iter(_bind(kernel, (), [x for x, u in zip(args, used, strict=True) if u]))
     return [
         next(numbers) if k else np.zeros(v.aval.shape, jax.dtypes.float0) for v, k in zip(outvars, known, strict=True)
     ]
@@ -84,6 +85,15 @@ def _(*args: Any, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> Any:
 
 
 def _lower(*args: Any, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> list[Any]:
+    began = waiting.begin()
+    try:
+        return _lowered(args, jaxpr, lanes)
+    finally:
+        if began:
+            waiting.end()
+
+
+def _lowered(args: Any, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> list[Any]:
     if not native.hindrances(jaxpr):
         try:
             return native.compiled(jaxpr, lanes)(*args)

@@ -1,15 +1,17 @@
 """A jaxpr as one function in the machine's code: for one element, or for a batch whose elements are lanes of vectors."""
 
 import contextlib
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import numpy as np
-from jax.extend.core import ClosedJaxpr
+from jax.extend.core import ClosedJaxpr, Literal
 
 from ..entries import NotEntryByEntry
 from ..jaxprs import equations
+from ..numbers import on_numbers
 from . import machine
 from .arrays import SMALL, Buffer, View, row_major
 from .control import KNOWN, Control
@@ -22,6 +24,8 @@ from .refill import Refilled, main_loop
 
 # More instructions than these take longer to compile than they save.
 LIMIT = 60_000
+# `extent` counts up to this many for each that is written: it knows of no zeros, and of nothing that is there twice.
+AT_MOST = 4
 # Bytes of memory that a function may take for its arrays, all lanes of a vector together.
 HEAP = 2**30
 # Loops over this many entries use the machine's longest vectors: a chain of 64 pendulums gains 15 %, arrays of ten lose 25 %.
@@ -35,12 +39,28 @@ def hindrances(jaxpr: ClosedJaxpr) -> tuple[str, ...]:
     found = []
     for eqn in equations(jaxpr):
         avals = [v.aval for v in (*eqn.invars, *eqn.outvars)]
-        if eqn.effects or eqn.primitive.name not in KNOWN or not all(map(_has_kind, avals)):
+        if eqn.effects or not (eqn.primitive.name in KNOWN or _is_number(eqn)) or not all(map(_has_kind, avals)):
             found.append(eqn.primitive.name)
     arguments = [v.aval.size > SMALL for v in jaxpr.jaxpr.invars]
-    if not found and (not machine.available() or extent(jaxpr, arguments)[0] > LIMIT):
+    if not found and (not machine.available() or _is_too_large(jaxpr, extent(jaxpr, arguments)[0])):
         found.append("size")
     return tuple(dict.fromkeys(found))
+
+
+def _is_too_large(jaxpr: ClosedJaxpr, estimate: int) -> bool:
+    if not LIMIT < estimate <= AT_MOST * LIMIT:
+        return estimate > LIMIT
+    with contextlib.suppress(NotEntryByEntry):
+        written(jaxpr, ())
+        return False
+    return True
+
+
+def _is_number(eqn: Any) -> bool:
+    """Whether an equation gives a number that is known already, as the factorials of Taylor arithmetic are."""
+    if not all(isinstance(v, Literal) for v in eqn.invars):
+        return False
+    return on_numbers(eqn, [np.asarray(v.val, v.aval.dtype) for v in eqn.invars]) is not None
 
 
 def _has_kind(aval: Any) -> bool:
@@ -48,7 +68,8 @@ def _has_kind(aval: Any) -> bool:
     return dtype == jax.dtypes.float0 or (dtype is not None and np.dtype(dtype).name in KINDS)
 
 
-def written(jaxpr: ClosedJaxpr, batched: Sequence[bool] = (), always_copies: bool = False) -> str:
+@functools.lru_cache(maxsize=2)
+def written(jaxpr: ClosedJaxpr, batched: tuple[bool, ...] = (), always_copies: bool = False) -> str:
     """The module whose function `{name}.kernel` computes the outputs from the inputs.
 
     With `batched` inputs the function is that of a batch: these inputs, and all outputs, have a leading axis of any
@@ -161,7 +182,7 @@ def compiled(
     jaxpr: ClosedJaxpr, batched: Sequence[bool] = (), always_copies: bool = False
 ) -> Callable[..., list[Any]]:
     """The function as one that JAX calls; arguments and results as `written` has them."""
-    name = machine.register(written(jaxpr, batched, always_copies))
+    name = machine.register(written(jaxpr, tuple(batched), always_copies))
     first = list(batched).index(True) if any(batched) else None
 
     def call(*xs: Any) -> list[Any]:

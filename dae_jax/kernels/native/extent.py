@@ -5,6 +5,7 @@ from typing import Any
 
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
+from ..entries import STRUCTURAL
 from .arrays import SMALL
 from .flat import CALLS, of_solve
 from .in_memory import LARGE
@@ -12,6 +13,8 @@ from .in_memory import LARGE
 
 # A loop over an array takes about as many as a few entries do.
 LOOP = 12
+# What moves entries takes none where these are in registers.
+_MOVES = STRUCTURAL - {"add_any", "dot_general", "reduce_max", "reduce_sum"} | {"unstack"}
 
 
 def extent(jaxpr: ClosedJaxpr | Jaxpr, in_memory: Sequence[bool]) -> tuple[int, list[bool]]:
@@ -45,4 +48,6 @@ def _of_equation(eqn: Any, args: list[bool]) -> tuple[int, list[bool]]:
         found = [extent(branch, args[1:]) for branch in p["branches"]]
         return sum(count for count, _ in found), kept
     by_loops = any(args) or max(sizes, default=0) > LARGE
+    if name in _MOVES and not by_loops:
+        return 0, kept
     return sum(min(size, LOOP) if by_loops else size for size in sizes), [by_loops and large for large in kept]
