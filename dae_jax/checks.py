@@ -12,6 +12,7 @@ from .constraints import MechanicalODE
 from .initialise import unsolved, violation
 from .normals import Rank
 from .regularity import mass_is_regular, mass_message, rank_message, rank_of, redundancy
+from .solution import RESULTS
 from .states import NUMBERS, brief, refuse_wrong_state
 from .systems import ConstrainedSystem, ImplicitDAE
 from .user_functions import not_finite, time_axis_advice
@@ -86,6 +87,8 @@ def refuse_bad_start(system: Any, t0: Any, y0: Any, args: Any, invertible: bool)
         left = _look_at_residual(system, t0, y0, args)
         if not bool(left.consistent()):
             raise ValueError(left.message() + _advice(system, t0, y0, args))
+        if bool(left.several):
+            raise ValueError(RESULTS[RESULTS.ambiguous_start])
         return None
     ode, mass, regular, found, redundant = _look(system, t0, y0, args, invertible)
     if not bool(regular):

@@ -12,9 +12,10 @@ from .constraints import MechanicalODE
 from .linalg import fixed_point, implicit_root, relative_change
 from .normals import Rank, mass_solve
 from .pencil import Pencil
+from .rates import is_nonlinear, rates_of
 from .regularity import has_rank, is_near_constraints, mass_is_regular, weakest
 from .residual import ResidualForm
-from .states import broadcast_to_state, refuse_wrong_state
+from .states import broadcast_to_state, refuse_wrong_state, with_rates
 from .systems import ConstrainedSystem, System
 from .underlying import StructuralODE
 from .user_functions import refuse_wrong_functions
@@ -65,12 +66,13 @@ def violation(ode: MechanicalODE, t: Any, y: Any) -> Violation:
 
 class Unsolved(eqx.Module):
     """What is left of the equations and the hidden ones for the best derivatives, and how much of it counts as round-off
-    of the user's numbers.
+    of the user's numbers; whether `several` derivatives satisfy the equations.
     """
 
     residuals: Float[Array, " m"]
     allowed: Float[Array, " m"]
     equations: tuple[str, ...] = eqx.field(static=True)
+    several: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(False))
 
     def consistent(self) -> Bool[Array, ""]:
         """Whether every equation has a solution; false for NaN."""
@@ -91,13 +93,14 @@ def unsolved(system: System, t: Any, state: Any, args: Any) -> Unsolved:
     pencil = Pencil.of(form, y)
     if pencil.outline.hidden:
         ode = StructuralODE.of(form, y.dtype, complete=True)
-        return _left_over(ode, t, ode.start(t, y, jnp.zeros(form.size, y.dtype)))
+        return _left_over(ode, t, ode.encode(t, state))
+    several = rates_of(form, t, y)[1] if is_nonlinear(form, y.dtype) else jnp.asarray(False)
     yd = pencil.rates(t, y)
     j, m = pencil.jacobians(t, y, yd)
     size = lambda x: 1 + jnp.max(jnp.abs(x))
     ones = jnp.ones_like(y)
     terms = pencil.storage.apply(jnp.abs(j), size(y) * ones) + pencil.storage.apply(jnp.abs(m), size(yd) * ones)
-    return Unsolved(pencil.residual(t, y, yd), jnp.finfo(y.dtype).eps ** 0.5 * terms, form.equations)
+    return Unsolved(pencil.residual(t, y, yd), jnp.finfo(y.dtype).eps ** 0.5 * terms, form.equations, several)
 
 
 def _left_over(ode: StructuralODE, t: Any, y: Float[Array, " N"]) -> Unsolved:
@@ -109,11 +112,13 @@ def look_at_start(
     system: System, t: Any, state: Any, args: Any, rank: int | Rank | None, invertible: bool
 ) -> tuple[Int[Array, ""], Bool[Array, ""]]:
     """What is wrong with a start: 0 for nothing, 1: it is inconsistent, 2: the constraints have not the given rank (`None`:
-    all are independent), 3: the masses; and whether nothing is wrong beyond doubt. `invertible`: whether M must be.
+    all are independent), 3: the masses, 4: several ẏ satisfy the equations; and whether nothing is wrong beyond doubt.
+    `invertible`: whether M must be.
     """
     if not isinstance(system, ConstrainedSystem):
-        consistent = unsolved(system, t, state, args).consistent()
-        return jnp.where(consistent, 0, 1), consistent
+        left = unsolved(system, t, state, args)
+        consistent = left.consistent()
+        return jnp.where(consistent, jnp.where(left.several, 4, 0), 1), consistent & ~left.several
     ode = MechanicalODE.of(system, t, state, args, rank)
     y = ode.encode(state)
     consistent, regular = violation(ode, t, y).consistent(), mass_is_regular(ode, y[0], invertible)
@@ -155,7 +160,7 @@ def look_at_end(
 
 
 def consistent_state(
-    system: System, t0: Any, y0: Any, args: Any = None, *, fixed: Any = None, rates: Any = None
+    system: System, t0: Any, y0: Any, args: Any = None, *, fixed: Any = None, rates: Any = None, yd0: Any = None
 ) -> Any:
     """The nearest state that satisfies the equations and the hidden ones.
 
@@ -169,11 +174,13 @@ def consistent_state(
       the differential variables of a circuit.
     - `rates`: ẏ in the structure of `y0`, where that is given: all 0 for a state of rest. It counts for the variables
       whose derivative occurs in the equations. All entries of the state then count alike for mechanisms also.
+    - `yd0`: near which ẏ is looked for, for an `ImplicitDAE` that is nonlinear in it.
 
     Errors: `ValueError` where no such state is found from here, naming the equations that remain off; NaN where the
     arguments are traced.
     """
     refuse_wrong_state(system, y0)
+    system = with_rates(system, yd0, y0)
     y0 = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
     refuse_wrong_functions(system, t0, y0, args)
     masks = jax.tree.map(lambda x: jnp.zeros_like(x, dtype=bool), y0)

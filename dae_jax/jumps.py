@@ -201,7 +201,12 @@ def solve_with_jumps(
     result = eqx.tree_at(lambda r: r._value, RESULTS.successful, p.code)
     precision = precision_of(t0.dtype, solve.controller)
     sol = DAESolution(t0, t1, p.ts, p.ys, None, stats, result, None, args, rank, precision)
-    refused = (RESULTS.inconsistent_start, RESULTS.dependent_constraints, RESULTS.irregular_mass)
+    refused = (
+        RESULTS.inconsistent_start,
+        RESULTS.dependent_constraints,
+        RESULTS.irregular_mass,
+        RESULTS.ambiguous_start,
+    )
     return sol, ~jnp.any(jnp.stack([p.code == code._value for code in refused]))
 
 

@@ -14,6 +14,7 @@ from .constraints import at_one_instant
 from .linalg.dense import LOOPED
 from .linalg.storage import Banded, Dense, Storage
 from .offsets import Combination, Offsets, find_offsets
+from .rates import is_nonlinear, rates_of
 from .reduced import ReducedForm
 from .residual import ResidualForm
 from .structure import (
@@ -153,9 +154,11 @@ class Pencil(eqx.Module):
 
     def rates(self, t: Any, y: Float[Array, " n"]) -> Float[Array, " n"]:
         """ẏ with F(t, y, ẏ) = 0 where y is consistent, else with the least F; for variables whose derivative does not occur
-        what the form knows. Gauss–Newton's method.
+        what the form knows. Gauss–Newton's method, or a search where F is nonlinear in ẏ.
         """
         t = jnp.asarray(t, y.dtype)
+        if is_nonlinear(self.form, y.dtype):
+            return rates_of(self.form, t, y)[0]
 
         def improve(_: Any, yd: Any) -> Any:
             return yd - self.storage.least_squares(self._by_rate(t, y, yd), self.residual(t, y, yd))

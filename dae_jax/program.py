@@ -323,7 +323,7 @@ class Solve(eqx.Module):
         code = RESULTS.where(stuck & end.singular, RESULTS.singular_configuration, code)
         code = RESULTS.where(went_well & ~end.near, RESULTS.off_constraints, code)
         code = RESULTS.where(end.masses & (end.masses_ahead | went_well), code, RESULTS.irregular_mass)
-        for wrong, name in enumerate(("inconsistent_start", "dependent_constraints", "irregular_mass"), 1):
+        for wrong, name in enumerate(("inconsistent_start", "dependent_constraints", "irregular_mass", "ambiguous_start"), 1):
             code = RESULTS.where(start == wrong, getattr(RESULTS, name), code)
         return DAESolution(*fields, code, event_mask, args, rank[1] if isinstance(rank, tuple) else rank, precision)
 

@@ -126,8 +126,20 @@ class ResidualForm(eqx.Module):
         """The state in the user's structure."""
         return self.layout.unflatten(y[: self.layout.size])
 
+    @property
+    def may_be_nonlinear(self) -> bool:
+        """Whether ẏ may occur other than linearly."""
+        return isinstance(self.system, ImplicitDAE)
+
+    @property
+    def rates_are_given(self) -> bool:
+        """Whether the user said what ẏ is near at the start."""
+        return isinstance(self.system, ImplicitDAE) and self.system.yd0 is not None
+
     def known_rates(self, y: Float[Array, " n"]) -> Float[Array, " n"]:
-        """What y itself says of ẏ: nothing, 0."""
+        """What is known of ẏ: what the user said of it, else nothing, 0."""
+        if isinstance(self.system, ImplicitDAE) and self.system.yd0 is not None:
+            return self.layout.flatten(self.system.yd0).astype(y.dtype)
         return jnp.zeros_like(y)
 
     @at_one_instant

@@ -24,6 +24,7 @@ from .program import Program, Solve, run, split
 from .solution import DAESolution
 from .solve_options import refuse_misfits, refuse_no_event, refuse_other_steps, refuse_wrong_options, takes_residuals
 from .solvers import SelectedResiduals, SelectedStates
+from .states import with_rates
 from .systems import System
 from .user_functions import not_finite, refuse_wrong_functions
 
@@ -40,6 +41,7 @@ def daesolve(
     y0: Any,
     args: Any = None,
     *,
+    yd0: Any = None,
     formulation: AbstractFormulation | None = None,
     saveat: diffrax.SaveAt = diffrax.SaveAt(t1=True),  # noqa: B008
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
@@ -59,6 +61,7 @@ def daesolve(
     - `t0`, `t1`, `dt0`: start, end and first (or fixed) step; t1 < t0 integrates backwards, with dt0 < 0.
     - `y0`: the state at `t0`: (q, v), (x, z) or y, as the system has it; must satisfy the equations, also the hidden ones.
     - `args`: handed to the system's functions.
+    - `yd0`: ẏ at the start, or near it, in the structure of `y0`: for an `ImplicitDAE` that is nonlinear in ẏ.
     - `formulation`: which equations are integrated; by default `Differentiation()`, the underlying ODE; for solvers of
       0 = F(t, y, ẏ) such as `RadauIIA5`, `Residual()`, or `DummyDerivatives()` where these need not converge for the
       equations as they are written (an index that is too high, or a null space of ∂F/∂ẏ that changes).
@@ -75,8 +78,8 @@ def daesolve(
     fails, or a `RESULTS` code with `throw=False`.
     """
     inputs = prepared(
-        system, solver, t0, t1, dt0, y0, args, formulation, saveat, stepsize_controller, adjoint, event, max_steps,
-        progress_meter,
+        with_rates(system, yd0, y0), solver, t0, t1, dt0, y0, args, formulation, saveat, stepsize_controller, adjoint, event,
+        max_steps, progress_meter,
     )  # fmt: skip
     program, arrays = split(inputs)
     if any(isinstance(x, jax.core.Tracer) for x in arrays):

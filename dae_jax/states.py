@@ -1,5 +1,6 @@
 """What the user gives as system and state: wrong types and shapes are refused in a sentence."""
 
+import dataclasses
 import inspect
 from typing import Any
 
@@ -107,3 +108,15 @@ def broadcast_to_state(name: str, tree: Any, state: Any, what: str) -> Any:
     raise ValueError(
         f"`{name}` must hold {what} in the structure of the state, {describe(state)}, but is {describe(tree)}."
     )
+
+
+def with_rates(system: Any, yd0: Any, state: Any) -> Any:
+    """The system with `yd0`, ẏ near the start, where that is given; refuses one for a system that is explicit in ẏ."""
+    if yd0 is None:
+        return system
+    if not isinstance(system, ImplicitDAE):
+        raise ValueError(
+            f"`yd0` is for an ImplicitDAE, whose equations may have several solutions ẏ; those of a "
+            f"{type(system).__name__} give one."
+        )
+    return dataclasses.replace(system, yd0=broadcast_to_state("yd0", yd0, state, "numbers"))

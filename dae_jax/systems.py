@@ -103,12 +103,14 @@ class ImplicitDAE(eqx.Module):
     **Arguments**
 
     - `residual(t, y, yd, args)`: F, any pytree with as many numbers as y; `yd` is ẏ, with the structure of y.
+    - `yd0`: ẏ at the start, or near it, with the structure of y: where F is nonlinear in ẏ, several may satisfy it.
 
     Source: K. E. Brenan, S. L. Campbell, L. R. Petzold, *Numerical Solution of Initial-Value Problems in
     Differential-Algebraic Equations*, eq. 1.1.1.
     """
 
     residual: Callable[..., Any]
+    yd0: Any = None
 
     def __check_init__(self) -> None:
         _require_functions(self, "residual")

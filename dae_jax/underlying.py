@@ -24,6 +24,7 @@ from .linalg import (
     tearing,
 )
 from .offsets import Combination, derivative_of, find_offsets
+from .rates import is_nonlinear, rates_of
 from .residual import ResidualForm
 from .structure import interpreted
 from .systems import ConstrainedSystem
@@ -286,21 +287,30 @@ class StructuralODE(ManifoldODE):
 
     def encode(self, t: Any, state: Any) -> Float[Array, " N"]:
         """Y of a state: the derivatives of order 1 and higher are those with which the equations hold, or nearly hold."""
-        return self.start(t, self.form.encode(state), jnp.zeros(self.form.size))
+        values = self.form.encode(state)
+        guess = rates_of(self.form, t, values)[0] if is_nonlinear(self.form, values.dtype) else None
+        return self.start(t, values, jnp.zeros(self.form.size), guess=guess)
 
     def start(
-        self, t: Any, values: Float[Array, " n"], freedom: Float[Array, " n"], rates: Float[Array, " n"] | None = None
+        self,
+        t: Any,
+        values: Float[Array, " n"],
+        freedom: Float[Array, " n"],
+        rates: Float[Array, " n"] | None = None,
+        guess: Float[Array, " n"] | None = None,
     ) -> Float[Array, " N"]:
         """Y near the values of the variables, each of which may move as much as its `freedom` says (0: not at all; 1: no
-        more than the others), with the least H. Gauss–Newton's method, the derivatives from 0; the first ones are
-        `rates` where that is given.
+        more than the others), with the least H. Gauss–Newton's method, the derivatives from 0 or, the first ones, from
+        `guess`; these are `rates` where that is given.
         """
         index = self.orders.values
         weights = take(freedom.astype(values.dtype), index) + np.where(index < 0, FREE, 0)
         known = take(values, index)
+        first = self.orders.first_derivatives
+        guess = self.form.known_rates(values) if guess is None else guess
+        known = known + take(guess if rates is None else rates, first)
         if rates is not None:
-            first = self.orders.first_derivatives
-            known, weights = known + take(rates, first), jnp.where(first < 0, weights, 0)
+            weights = jnp.where(first < 0, weights, 0)
         return _nearest(self, t, known, weights)
 
 

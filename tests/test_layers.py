@@ -18,6 +18,7 @@ LAYERS = (
         "normals",
         "offsets",
         "pencil",
+        "rates",
         "reduced",
         "regularity",
         "residual",
