@@ -152,7 +152,7 @@ class Solve(eqx.Module):
         check, check_arrays = self._check(system, t0, y0, args, rank, end)
         # A yes or no has no derivative.
         found = one_kernel(check, self.derivative())(jax.lax.stop_gradient(check_arrays))
-        (_, as_expected), _ = found
+        (_, as_expected), *_ = found
         return self._solution(fields, args, rank, found), as_expected
 
     def refuse_wrong_functions(self, system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any) -> None:
@@ -174,13 +174,18 @@ class Solve(eqx.Module):
             tolerances = tuple(jnp.max(jnp.asarray(getattr(self.controller, name))) for name in ("rtol", "atol"))
         else:
             tolerances = (0.0, 0.0) if residual else (COARSE, COARSE)
-        program, arrays = split((system, t0, y0, args, end, tolerances))
+        program, arrays = split((system, t0, y0, args, end, tolerances, self.event))
         invertible = self.formulation.inverts_mass
 
         def check(arrays: Any) -> Any:
-            *inputs, end, tolerances = program.inputs(arrays)
+            *inputs, end, tolerances, event = program.inputs(arrays)
             start = look_at_start(*inputs, rank, invertible)
-            return start, look_at_end(*inputs, rank, invertible, end, keeps, tolerances, residual)
+            (t, state), (*_, args) = end, inputs
+            conditions = [] if event is None else jax.tree.leaves(event.cond_fn, is_leaf=callable)
+            finite = [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(state)]
+            defined = [~jnp.isnan(condition(t, state, args)) for condition in conditions]
+            numbers = (jnp.all(jnp.stack(finite)), jnp.all(jnp.asarray(defined, bool)))
+            return start, look_at_end(*inputs, rank, invertible, end, keeps, tolerances, residual), numbers
 
         return check, arrays
 
@@ -279,7 +284,12 @@ class Solve(eqx.Module):
         saveat = eqx.tree_at(lambda s: s.subs, self.saveat, subs, is_leaf=lambda x: x is None)
         event = self.event and dataclasses.replace(
             self.event,
-            cond_fn=jax.tree.map(lambda c: _on_states(c, decode, args), self.event.cond_fn, is_leaf=callable),
+            cond_fn=jax.tree.map(
+                lambda c, up: _on_states(c, decode, args, up),
+                self.event.cond_fn,
+                self.event.direction,
+                is_leaf=lambda x: x is None or callable(x),
+            ),
         )
         selects = isinstance(solver, SelectedStates | SelectedResiduals)
         saveat = dataclasses.replace(saveat, solver_state=True) if selects else saveat
@@ -304,7 +314,7 @@ class Solve(eqx.Module):
 
     def _solution(self, out: Any, args: Any, rank: int | Rank | None, found: Any) -> DAESolution:
         *fields, code, event_mask = out
-        (start, _), end = found
+        (start, _), end, (finite_end, defined) = found
         _, _, ts, ys, *_ = fields
         failed = lambda name, instead, when=True: RESULTS.where((code == name) & when, instead, code)
         if isinstance(self.formulation, Residual):
@@ -313,11 +323,12 @@ class Solve(eqx.Module):
             code = failed(RESULTS.singular, RESULTS.singular_iteration_matrix)
         code = failed(RESULTS.dt_min_reached, RESULTS.step_rejected)
         code = failed(RESULTS.nonlinear_divergence, RESULTS.off_manifold)
-        if ts is not None:
-            finite = [all_finite(*pair) for pair in _saved(self.saveat, ts, ys)]
-            code = failed(RESULTS.successful, RESULTS.not_finite, ~jnp.all(jnp.stack(finite))) if finite else code
+        finite = [all_finite(*pair) for pair in _saved(self.saveat, ts, ys)] if ts is not None else []
         precision = precision_of(fields[0].dtype, self.controller)
         went_well = (code == RESULTS.successful) | (code == RESULTS.event_occurred)
+        code = RESULTS.where(went_well & ~jnp.all(jnp.stack([finite_end, *finite])), RESULTS.not_finite, code)
+        went_well = (code == RESULTS.successful) | (code == RESULTS.event_occurred)
+        code = RESULTS.where(went_well & ~defined, RESULTS.undefined_condition, code)
         stuck = [RESULTS.step_rejected, RESULTS.off_manifold, RESULTS.no_convergence, RESULTS.error_too_large]
         stuck = jnp.any(jnp.stack([code == name for name in (*stuck, RESULTS.singular_iteration_matrix)]))
         code = RESULTS.where(stuck & end.singular, RESULTS.singular_configuration, code)
@@ -368,11 +379,13 @@ def _uniform(solver: Any, path: diffrax.DenseInterpolation) -> diffrax.DenseInte
     return eqx.tree_at(lambda p: p.y0_if_trivial, path, first)
 
 
-def _on_states(cond: Callable[..., Any], decode: Any, args: Any) -> Callable[..., Any]:
+def _on_states(cond: Callable[..., Any], decode: Any, args: Any, up: bool | None) -> Callable[..., Any]:
     user_args = args
 
     def condition(t: Any, y: Any, args: Any, **kwargs: Any) -> Any:
-        return cond(t, decode(t, y, args), user_args, **kwargs)
+        value = cond(t, decode(t, y, args), user_args, **kwargs)
+        # NaN crosses in no direction: it ends the solve here, which then says so.
+        return value if up is None else jnp.where(jnp.isnan(value), 1 if up else -1, value)
 
     return condition
 

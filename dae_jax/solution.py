@@ -49,6 +49,10 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "The solution is not finite: the force, the mass matrix or a constraint returned NaN or infinity, a mass became "
         "negative, the constraints became dependent, or the steps are too large for the method."
     )
+    undefined_condition = (
+        "The condition of an event is not a number (NaN) where the solve ended: an event there is not seen. Let it be defined "
+        "on either side of its zero."
+    )
     step_rejected = (
         "The step size went to the resolution of time: at the last time reached the force is not finite, the "
         "constraints become dependent (a singular configuration), contradict each other or jump, or the equations do not "

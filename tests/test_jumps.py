@@ -178,3 +178,25 @@ def test_a_condition_is_a_number_that_crosses_zero():
     event = dae_jax.Jump(lambda t, y, args, **_: y[0][1] < 0, lambda t, y, args: (y, args))
     with pytest.raises(ValueError, match=r"must return a real number, whose zero is the event, but returns .*bool"):
         dae_jax.daesolve(BALL, diffrax.Tsit5(), 0.0, 1.0, None, RELEASED, event=event)
+
+
+@pytest.mark.parametrize("direction", [None, True, False])
+def test_a_condition_that_is_no_number_is_an_error(direction):
+    """NaN has no sign: nothing would be seen of it."""
+    condition = lambda t, y, args, **_: jnp.where(t > 0.4, jnp.nan, -1.0 if direction else 1.0)
+    solve = lambda event: dae_jax.daesolve(BALL, diffrax.Tsit5(), 0.0, 1.0, None, RELEASED, event=event, throw=False)
+    ended = solve(diffrax.Event(condition, direction=direction))
+    assert ended.result == dae_jax.RESULTS.undefined_condition
+    went_on = solve(dae_jax.Jump(condition, lambda t, y, args: (y, args), direction=direction))
+    assert went_on.result not in (dae_jax.RESULTS.successful, dae_jax.RESULTS.event_occurred)
+
+
+def test_a_state_that_is_no_number_is_no_event():
+    """The step after t = 0.5 fails, and with it the condition."""
+    system = dae_jax.ConstrainedSystem(
+        lambda t, q, v, args: jnp.where(t > 0.5, jnp.nan, -GRAVITY) * jnp.array([0.0, 1.0]), lambda t, q, args: q[0]
+    )
+    event = diffrax.Event(lambda t, y, args, **_: y[0][1] + 10.0)
+    for solver in (diffrax.Tsit5(), dae_jax.OrthogonalProjection(diffrax.Tsit5())):
+        sol = dae_jax.daesolve(system, solver, 0.0, 1.0, 0.1, RELEASED, event=event, throw=False)
+        assert sol.result not in (dae_jax.RESULTS.successful, dae_jax.RESULTS.event_occurred)
