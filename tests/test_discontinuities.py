@@ -76,3 +76,40 @@ def test_jumps_that_are_announced_are_stepped_to(solver):
     )  # fmt: skip
     assert abs(found - exact) < 3e-7
     assert steps < 0.6 * unannounced
+
+
+@pytest.mark.parametrize("tolerance", [1e-4, 1e-8])
+@pytest.mark.parametrize("solver", [dae_jax.RadauIIA5(), dae_jax.BDF()], ids=["radau", "bdf"])
+def test_a_voltage_jumps_from_one_side_of_a_diode_to_the_other(solver, tolerance):
+    """A buck converter: the coil's current leaves the switch for the diode, where a whole Newton correction overflows."""
+    coil, capacitor, load, supply, on, off, period = 1e-3, 1e-4, 10.0, 24.0, 0.01, 1e6, 1e-4
+
+    def residual(t, y, yd, args):
+        current, voltage, node = y
+        switch = jnp.where(t % period < 0.4 * period, on, off)
+        diode = 1e-9 * jnp.expm1(jnp.minimum(-node / 0.05, 80.0))
+        return jnp.stack(
+            [
+                coil * yd[0] - (node - voltage),
+                capacitor * yd[1] - (current - voltage / load),
+                (supply - node) / switch + diode - current,
+            ]
+        )
+
+    system = dae_jax.ImplicitDAE(residual)
+    start = dae_jax.consistent_state(system, 0.0, jnp.array([0, 0, supply]), fixed=jnp.array([True, True, False]))
+    switched = jnp.array([0.4, 1.0, 1.4, 2.0, 2.4]) * period
+    control = diffrax.ClipStepSizeController(diffrax.PIDController(rtol=tolerance, atol=tolerance), jump_ts=switched)
+    sol = dae_jax.daesolve(system, solver, 0.0, 2.7 * period, None, start, stepsize_controller=control, max_steps=20_000)
+    current, voltage, node = sol.ys[-1]
+    # The same with the node eliminated by hand, by the midpoint rule with steps of 10 ns.
+    y = np.zeros(2)
+    n = 27_000
+    h = 2.7 * period / n
+    for i in range(n):
+        conducting = (i + 0.5) * h % period < 0.4 * period
+        driven = lambda y, conducting=conducting: supply - on * y[0] if conducting else -0.05 * np.log1p(y[0] / 1e-9)
+        slope = lambda y, driven=driven: np.array([(driven(y) - y[1]) / coil, (y[0] - y[1] / load) / capacitor])
+        y = y + h * slope(y + h / 2 * slope(y))
+    np.testing.assert_allclose([current, voltage], y, atol=30 * tolerance + 2e-6)
+    assert -1.2 < node < -0.9

@@ -17,6 +17,7 @@ from .residual_steps import (
     Tolerances,
     at_the_floor,
     constant,
+    damped,
     is_smallest,
     not_begun,
     of_step,
@@ -265,8 +266,12 @@ def _solve(step: _Step, y0: Any, state: _State, smallest: Any, tol: Tolerances) 
         start = jnp.where(tries > 2, before.x, step.y)
         factors, pivot = lax.cond(renew, lambda: step.factor(start), lambda: (factors, jnp.full_like(step.c, jnp.inf)))
         correction = lambda y: -step.pencil.solve(factors, step.residual(y))
-        most = jnp.where(tries > 1, 1, tol.corrections)
-        newton = simplified_newton(correction, start, scale, jnp.where(renew, 1, state.eta), tol, most)
+        eta = jnp.where(renew, 1, state.eta)
+        newton = lax.cond(
+            tries > 1,
+            lambda: damped(correction, start, scale, eta, tol),
+            lambda: simplified_newton(correction, start, scale, eta, tol),
+        )
         return tries + 1, fresh | renew, newton, factors, pivot
 
     def again(carry: Any) -> Any:

@@ -31,6 +31,7 @@ from .residual_steps import (
     Tolerances,
     at_the_floor,
     constant,
+    damped,
     is_smallest,
     not_begun,
     of_step,
@@ -255,8 +256,12 @@ def _solve(step: _Step, state: _State, smallest: Any, tol: Tolerances) -> Any:
         factors, pivot = lax.cond(
             renew | (h != state.factored), lambda: step.factor(jacobians), lambda: (factors, infinite)
         )
-        most = jnp.where(tries > 1, 1, tol.corrections)
-        newton = simplified_newton(lambda z: step.correction(factors, z), start, scale, state.eta, tol, most)
+        correction = lambda z: step.correction(factors, z)
+        newton = lax.cond(
+            tries > 1,
+            lambda: damped(correction, start, scale, state.eta, tol),
+            lambda: simplified_newton(correction, start, scale, state.eta, tol),
+        )
         return tries + 1, fresh | renew, newton, jacobians, factors, pivot
 
     def again(carry: Any) -> Any:

@@ -18,6 +18,8 @@ from ..linalg import rms_norm, roundoff
 NOISE = 0.33
 # Round-off of the divided differences of algebraic variables, in parts of the variables over h.
 NOISY = 1000
+# How often a correction is halved where algebraic variables jump.
+HALVINGS = 40
 # Where algebraic variables jump, Newton's method with a Jacobian of its own for each of its corrections.
 FULL = 30
 
@@ -118,7 +120,7 @@ def not_begun(start: Any, eta: Any) -> Newton:
 
 
 def simplified_newton(
-    correction: Callable[[Any], Any], start: Any, scale: Any, eta: Any, tol: Tolerances, corrections: Any
+    correction: Callable[[Any], Any], start: Any, scale: Any, eta: Any, tol: Tolerances
 ) -> Newton:
     """Corrects `start` until what remains, η ‖Δx‖, is small beside the tolerance; ‖Δx‖ is that of Δx · `scale`.
 
@@ -127,7 +129,7 @@ def simplified_newton(
     epsilon = jnp.finfo(start.dtype).eps
 
     def goes_on(s: Newton) -> Any:
-        return ~s.converged & ~s.diverged & (s.count < corrections)
+        return ~s.converged & ~s.diverged & (s.count < tol.corrections)
 
     def correct(s: Newton) -> Newton:
         dx = correction(s.x)
@@ -135,7 +137,7 @@ def simplified_newton(
         theta = size / jnp.maximum(s.last, jnp.finfo(start.dtype).tiny)
         first = s.count == 0
         eta = jnp.where(first, jnp.maximum(s.eta, 1e-3) ** 0.8, theta / jnp.maximum(1 - theta, epsilon))
-        remaining = corrections - 1 - s.count
+        remaining = tol.corrections - 1 - s.count
         stagnant = ~first & (theta >= 1)
         hopeless = stagnant | (eta * size * theta**remaining > tol.newton) & (size > NOISE)
         # A correction that does not shrink any more but is small is round-off.
@@ -145,6 +147,30 @@ def simplified_newton(
         return Newton(s.x + dx, s.count + 1, size, eta, theta, converged & jnp.isfinite(size), diverged)
 
     return lax.while_loop(goes_on, correct, not_begun(start, eta))
+
+
+def damped(correction: Callable[[Any], Any], x: Any, scale: Any, eta: Any, tol: Tolerances) -> Newton:
+    """One correction x + λ Δx, λ the largest power of ½ with which the next correction by the same matrix is smaller,
+    ‖Δx̄‖ ≤ (1 − λ/2) ‖Δx‖: where a variable jumps, a whole one may end where a function overflows. Converged where the next
+    one is small.
+
+    Source: P. Deuflhard, *Newton Methods for Nonlinear Problems*, sec. 3.1.4 (the restricted monotonicity test).
+    """
+    dx = correction(x)
+    size = rms_norm(dx * scale)
+
+    def halve(carry: Any) -> Any:
+        part, *_, count = carry
+        ahead = rms_norm(correction(x + part * dx) * scale)
+        shorter = ahead <= (1 - part / 2) * size
+        return jnp.where(shorter, part, part / 2), ahead, shorter, count + 1
+
+    begin = jnp.ones((), x.dtype), jnp.asarray(jnp.inf, x.dtype), jnp.asarray(False), 0
+    part, ahead, shorter, _ = lax.while_loop(lambda carry: ~carry[2] & (carry[3] < HALVINGS), halve, begin)
+    # Corrections that are round-off grow and shrink as they please.
+    converged = (ahead <= tol.newton) & shorter | (size <= tol.roundoff)
+    x = jnp.where(shorter | converged, x + part * dx, x)
+    return Newton(x, 1, size, eta, jnp.zeros_like(size), converged & jnp.isfinite(size), ~jnp.isfinite(size))
 
 
 class Failure(NamedTuple):
