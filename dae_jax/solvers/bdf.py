@@ -196,7 +196,8 @@ class BDF(AbstractResidualSolver):
         y1, error, result = at_the_floor(failure, t0, t1, y0, y1, constant(error))
         phi = jnp.stack(phi)
         new = _State(
-            phi[1:], method.psi, state.steps + 1, decision.order, k, alike, decision.rising, decision.factor * h, held,
+            phi[1:], method.psi, state.steps + 1, decision.order, k, alike, decision.rising, decision.factor * h,
+            held | (state.held & (decision.order > k)),
             *constant((factors, method.c, newton.eta)),
         )  # fmt: skip
         new = jax.tree.map(lambda a, b: jnp.where(jumped, a, b), _start(jnp.zeros_like(y1), new.factors), new)
@@ -308,7 +309,7 @@ def _decision(
     falls = jnp.where(k > 2, jnp.maximum(low, lowest) <= here, (k == 2) & (low <= here / 2))
     # The points of a lower order bend where the order rose, and at the start the differences are round-off.
     falls = falls & (k <= state.used) & (~state.rising | (here > SIGNIFICANT))
-    falls = falls & ((alike > k + 1) | (method.tail * change >= 1) | state.rising)
+    falls = falls & (~held | (method.tail * change >= 1))
     rising = state.rising & ~falls & (k < MAX_ORDER)
     settled = ~rising & (alike > k + 1) & (k - state.used != 1) & (k < MAX_ORDER)
     falls = falls | (settled & (k > 1) & (low <= jnp.minimum(here, high)))
