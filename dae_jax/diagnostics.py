@@ -89,7 +89,8 @@ def multipliers(system: ConstrainedSystem, *at: Any) -> Any:
     function, so that the condition of an event can use it; it costs one evaluation of the accelerations. Where constraints
     are redundant, the point form needs `ConstrainedSystem(..., rank=...)`.
 
-    Errors: `ValueError` for a system that is no `ConstrainedSystem`: there, multipliers are among the unknowns.
+    Errors: `ValueError` for a system that is no `ConstrainedSystem`: there, multipliers are among the unknowns; and where a
+    point that is concrete has none.
     """
     refuse_wrong_system(system)
     if not isinstance(system, ConstrainedSystem):
@@ -104,7 +105,13 @@ def multipliers(system: ConstrainedSystem, *at: Any) -> Any:
     t, q, v, *args = at
     state = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), (q, v))
     refuse_wrong_state(system, state)
-    return _multipliers(system, t, state, args[0] if args else None, system.rank)
+    found = _multipliers(system, t, state, args[0] if args else None, system.rank)
+    if not isinstance(found, jax.core.Tracer) and bool(jnp.any(jnp.isnan(found))):
+        raise ValueError(
+            "`multipliers` finds none at this point: the force or a constraint is not a number, or the constraints depend on each "
+            "other there; where they are redundant say how many are independent by `ConstrainedSystem(..., rank=...)`."
+        )
+    return found
 
 
 def _multipliers(system: ConstrainedSystem, t: Any, y: Any, args: Any, rank: Any) -> Float[Array, " mp"]:

@@ -181,6 +181,12 @@ class Pencil(eqx.Module):
         seen = (indices > 1) & self.form.shown
         return weights * jnp.where(seen, jnp.clip(raised, 1, 1 / size), 1) if seen.any() else weights
 
+    def between(self, dense: bool) -> Bool[np.ndarray, " n"]:
+        """Of which variables the way between the ends of a step counts: the user's of index 2 and higher, which follow from
+        derivatives; with `dense` all of the user's.
+        """
+        return self.form.shown & (dense | (np.array(self.outline.indices) > 1))
+
     def counted(self, dense: bool) -> Bool[np.ndarray, " n"]:
         """Which variables are of index 0 or 1, or seen by the user where values between steps are wanted."""
         return (np.array(self.outline.indices) <= 1) | (dense & self.form.shown)

@@ -304,7 +304,7 @@ class StructuralODE(ManifoldODE):
         `guess`; these are `rates` where that is given.
         """
         index = self.orders.values
-        weights = take(freedom.astype(values.dtype), index) + np.where(index < 0, FREE, 0)
+        weights = take(freedom.astype(values.dtype), index) + jnp.asarray(np.where(index < 0, FREE, 0), values.dtype)
         known = take(values, index)
         first = self.orders.first_derivatives
         guess = self.form.known_rates(values) if guess is None else guess

@@ -211,3 +211,15 @@ def test_modules_and_version_are_there_when_they_are_used():
     assert done.stdout[0].isdigit()
     with pytest.raises(AttributeError, match="no attribute 'scene'"):
         _ = dae_jax.scene
+
+
+def test_multipliers_at_a_point_of_redundant_constraints_need_the_rank():
+    doubled = lambda rank: dae_jax.ConstrainedSystem(
+        lambda t, q, v, args: jnp.array([0.0, 9.81]), lambda t, q, args: jnp.stack([(q @ q - 1) / 2, q @ q - 1]), rank=rank
+    )
+    at = 0.0, jnp.array([1.0, 0.0]), jnp.array([0.0, 2.0])
+    with pytest.raises(ValueError, match="say how many are independent"):
+        dae_jax.multipliers(doubled(None), *at)
+    # The force on q, λ₁ q + 2 λ₂ q, is the centripetal one.
+    first, second = dae_jax.multipliers(doubled(1), *at)
+    np.testing.assert_allclose(first + 2 * second, 4.0, atol=1e-12)

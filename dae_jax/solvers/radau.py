@@ -97,7 +97,6 @@ class _Step(NamedTuple):
     t0: Any
     t1: Any
     y0: Float[Array, " n"]
-    dense: bool
 
     @property
     def h(self) -> Any:
@@ -156,9 +155,11 @@ class RadauIIA5(AbstractResidualSolver):
     with a source: in the smallest step that time resolves, each correction has a Jacobian of its own, and the error of
     differential variables alone counts.
 
-    That estimate does not know how an algebraic variable moves within a step. With `dense`, the error of the dense output
-    counts too: the fourth divided difference of the step's points and the start of the step before, at the largest value
-    of its polynomial; in a first step the third, without the start.
+    That estimate does not know how an algebraic variable moves within a step, nor what comes of it for variables of index 2
+    and higher, which follow from derivatives. The error of the polynomial through the step's points counts too, for all
+    variables of the user where values between steps are wanted (`dense`), for those of index 2 and higher always: the fourth
+    divided difference of the points and the start of the step before, at the largest value of its polynomial; in a first
+    step the third, without the start.
 
     **Arguments**
 
@@ -186,7 +187,7 @@ class RadauIIA5(AbstractResidualSolver):
     def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> _State:
         sign = clock(terms, t0, t1)
         zero = jnp.zeros((), y0.dtype)
-        step = _Step(args, sign, t0, t1, y0, self.dense)
+        step = _Step(args, sign, t0, t1, y0)
         unused = jax.eval_shape(lambda: (j := step.jacobians(t0, y0, y0), step.factor(j)[0]))
         jacobians, factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), unused)
         return _State(
@@ -200,7 +201,7 @@ class RadauIIA5(AbstractResidualSolver):
         state = solver_state._replace(
             refresh=solver_state.refresh | made_jump, h=jnp.where(made_jump, 0, solver_state.h)
         )
-        step = _Step(args, clock(terms, t0, t1), t0, t1, y0, self.dense)
+        step = _Step(args, clock(terms, t0, t1), t0, t1, y0)
         tol = tolerances(self.rtol, self.atol, y0.dtype)
         # The unknowns of a stage are interleaved, so that a band stays one.
         apart = lambda z: z.reshape(-1, 3).T
@@ -214,8 +215,9 @@ class RadauIIA5(AbstractResidualSolver):
         z = apart(flat)
         y1 = y0 + z[2]
         scaled = counted = _error(*constant((step, factors[0], z)), tol) * args.weights(step.h)
-        if self.dense:
-            between = _between(*constant((state, step.h, z))) * args.weights(step.h, tol.raised(True)) * args.form.shown
+        if args.between(self.dense).any():
+            weights = args.weights(step.h, tol.raised(True)) * args.between(self.dense)
+            between = _between(*constant((state, step.h, z))) * weights
             counted = jnp.where(jnp.abs(between) > jnp.abs(scaled), between, scaled)
         smallest = is_smallest(t0, t1)
         jumped = jumped | smallest & ~(tol.norm(counted, y0, y1) < 1)
@@ -243,7 +245,7 @@ def _solve(step: _Step, state: _State, smallest: Any, tol: Tolerances) -> Any:
     smallest step with new ones for each correction.
     """
     h, predicted = step.h, _predicted(state, step.h)
-    scale = step.pencil.weights(h, tol.raised(step.dense)) / tol.scale(step.y0)
+    scale = step.pencil.weights(h, tol.raised(True)) / tol.scale(step.y0)
 
     def attempt(carry: Any) -> Any:
         tries, fresh, before, jacobians, factors, _ = carry
