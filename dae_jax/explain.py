@@ -11,7 +11,7 @@ import numpy as np
 
 from .checks import refuse_bad_start, refuse_no_time
 from .constraints import MechanicalODE
-from .formulations import AbstractFormulation, DummyDerivatives, Residual
+from .formulations import AbstractFormulation, DummyDerivatives, ReducedResidual, Residual
 from .kernels import equations, hindrances, one_kernel_enabled, without_checks
 from .linalg.semidefinite import LOOPED, UNROLLED
 from .normals import SparseNormals
@@ -183,7 +183,8 @@ def explain(
     kernel, arrays = solve.kernel(*inputs[1:], rank)
     found = hindrances(jax.make_jaxpr(without_checks(kernel))(arrays))
     enabled = one_kernel_enabled() and jax.default_backend() == "cpu" and solve.derivative() != "any"
-    method = f"{_name(formulation or solve.formulation)}, {_name(solver)}"
+    reduced = isinstance(solve.formulation, ReducedResidual)
+    method = f"{_name(formulation or (DummyDerivatives() if reduced else solve.formulation))}, {_name(solver)}"
     if isinstance(solve.formulation, Residual):
         y, pencil = solve.formulation.encode(system, t0, y0, args)
         return _of_residual(pencil, t0, y, method, precision, enabled and not found, found)

@@ -25,7 +25,7 @@ from .solution import DAESolution
 from .solve_options import refuse_misfits, refuse_no_event, refuse_other_steps, refuse_wrong_options, takes_residuals
 from .solvers import SelectedResiduals, SelectedStates
 from .states import with_rates
-from .systems import System
+from .systems import ConstrainedSystem, System
 from .user_functions import not_finite, refuse_wrong_functions
 
 
@@ -97,7 +97,7 @@ def prepared(
     y0, args = checked(system, t0, t1, dt0, y0, args)
     refuse_wrong_options(saveat, stepsize_controller, adjoint, event, max_steps, progress_meter)
     if formulation is None and takes_residuals(solver):
-        formulation = _for_residuals(system, t0, y0, args)
+        formulation = _for_residuals(system, t0, y0, args, solver)
     elif formulation is None:
         formulation = Differentiation()
     refuse_misfits(system, formulation, solver, t0, y0, args)
@@ -127,9 +127,12 @@ def prepared(
     return solve, system, t0, t1, dt0, y0, args
 
 
-def _for_residuals(system: Any, t0: Any, y0: Any, args: Any) -> AbstractFormulation:
-    """The equations as they are written where all their variables are found to the order of the method, or nearly."""
-    return DummyDerivatives() if _why_not_as_written(system, t0, y0, args, Residual(), 2) else Residual()
+def _for_residuals(system: Any, t0: Any, y0: Any, args: Any, solver: Any) -> AbstractFormulation:
+    """The equations as they are written where the solver controls all their variables."""
+    if isinstance(system, ConstrainedSystem):
+        return Residual()
+    reason = _why_not_as_written(system, t0, y0, args, Residual(), solver.default_index)
+    return DummyDerivatives() if reason else Residual()
 
 
 def _why_not_as_written(system: Any, t0: Any, y0: Any, args: Any, formulation: Residual, highest: int) -> str:

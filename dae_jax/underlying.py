@@ -266,7 +266,7 @@ class StructuralODE(ManifoldODE):
             quality, available = jnp.minimum(quality, smallest), jnp.sum(taken, 0)
             embedding = np.zeros((len(d), y.size))
             embedding[place >= 0, place[place >= 0]] = 1
-            directions.append(jnp.sum(taken[:, :, None] * embedding, 1))
+            directions.append(jnp.sum(taken[:, :, None] * jnp.asarray(embedding, taken.dtype), 1))
             if chosen is not None:
                 _, smallest = _pivots(level * take(jnp.sum(chosen[first : first + len(rows)], 0), place))
                 present = jnp.minimum(present, smallest)

@@ -108,5 +108,5 @@ def test_at_the_end_a_variable_that_follows_from_a_derivative_is_right(solver, d
     start = jnp.array([0.0, 7.0], dtype)
     end = solved(system, IMPLICIT[solver], start, diffrax.SaveAt(t1=True), tolerance=tolerance).ys[-1]
     exact = np.array([np.sin(14.0), np.sin(14.0) + 7 * np.cos(14.0)])
-    # Round-off grows like 1/h in variables of index 2, and in float32 it is more than the tolerance.
-    np.testing.assert_allclose(end, exact, atol=100 * tolerance if dtype == jnp.float64 else 0.03)
+    # Round-off grows like 1/h in variables of index 2; where float32 has no more digits the tolerance does, too.
+    np.testing.assert_allclose(end, exact, atol=100 * tolerance if dtype == jnp.float64 else 0.1)

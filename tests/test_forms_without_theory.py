@@ -66,5 +66,7 @@ def test_constant_coefficients_and_hessenberg_form_are_taken_as_they_are():
     """A capacitor between two nodes: fewer equations with derivatives than derivatives, in one combination."""
     for name in ("capacitor-loop", "hessenberg-2", "amplifier"):
         scene = SCENES[name]()
-        plan = dae_jax.explain(scene.system, dae_jax.BDF(), 0.0, scene.y0, scene.args)
+        plan = dae_jax.explain(scene.system, dae_jax.RadauIIA5(), 0.0, scene.y0, scene.args)
+        assert plan.method == "Residual, RadauIIA5"
+        plan = dae_jax.explain(scene.system, dae_jax.BDF(), 0.0, scene.y0, scene.args, formulation=dae_jax.Residual())
         assert plan.method == "Residual, BDF"

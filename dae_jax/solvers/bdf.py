@@ -94,7 +94,6 @@ class _Step(NamedTuple):
     c: Any
     y: Float[Array, " n"]
     rate: Float[Array, " n"]
-    dense: bool
 
     def residual(self, y: Float[Array, " n"]) -> Float[Array, " n"]:
         """F at the new point."""
@@ -137,6 +136,7 @@ class BDF(AbstractResidualSolver):
     dense: bool = True
 
     highest_index = 2
+    default_index = 1
     interpolation_cls = NewtonPolynomial
 
     def order(self, terms: Any) -> int:
@@ -147,7 +147,7 @@ class BDF(AbstractResidualSolver):
 
     def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> _State:
         sign = clock(terms, t0, t1)
-        like = _Step(args, sign, t1, t1 - t0, 1 / (t1 - t0), y0, y0, self.dense)
+        like = _Step(args, sign, t1, t1 - t0, 1 / (t1 - t0), y0, y0)
         factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda: like.factor(y0)[0]))
         return _start(sign * args.start, factors)
 
@@ -170,7 +170,7 @@ class BDF(AbstractResidualSolver):
         y1, (newton, factors, pivot) = implicit_root(
             lambda y, params: params[0].residual(y),
             lambda params: _solve(*params),
-            (_Step(args, sign, t1, h, method.c, y, rate, self.dense), *constant((y0, state, is_smallest(t0, t1))), tol),
+            (_Step(args, sign, t1, h, method.c, y, rate), *constant((y0, state, is_smallest(t0, t1))), tol),
             linear_solve=lambda inverse, b: inverse(b),
             jacobian=lambda y, params: functools.partial(params[0].pencil.solve, params[0].factor(y)[0]),
         )
@@ -180,7 +180,7 @@ class BDF(AbstractResidualSolver):
             phi.append(jnp.where(j <= k, phi[-1] + star[j], phi[-1]))
         change, *phi = [phi[0], *reversed(phi[1:])]
 
-        scale = args.weights(h, tol.raised(self.dense)) * args.counted(self.dense) / tol.scale(y0, y1)
+        scale = args.weights(h) * args.counted(self.dense) / tol.scale(y0, y1)
         size = lambda row: rms_norm(constant(row * scale))
         sizes = [size(row) for row in phi]
         higher = size(change - _at(star, k + 1))
@@ -258,7 +258,7 @@ def _solve(step: _Step, y0: Any, state: _State, smallest: Any, tol: Tolerances) 
     """y at t₁, and how it was found: with the factors at hand first, with new ones where these fail, and in the smallest
     step with new ones for each correction.
     """
-    scale = step.pencil.weights(step.h, tol.raised(step.dense)) / tol.scale(y0)
+    scale = step.pencil.weights(step.h) / tol.scale(y0)
     changed = jnp.abs(step.c - state.c) > ALIKE * step.c
 
     def attempt(carry: Any) -> Any:

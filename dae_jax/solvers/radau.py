@@ -176,6 +176,7 @@ class RadauIIA5(AbstractResidualSolver):
     dense: bool = True
 
     highest_index = 3
+    default_index = 2
     interpolation_cls = CollocationPolynomial
 
     def order(self, terms: Any) -> int:
@@ -216,7 +217,7 @@ class RadauIIA5(AbstractResidualSolver):
         y1 = y0 + z[2]
         scaled = counted = _error(*constant((step, factors[0], z)), tol) * args.weights(step.h)
         if args.between(self.dense).any():
-            weights = args.weights(step.h, tol.raised(True)) * args.between(self.dense)
+            weights = args.weights(step.h, tol.raised()) * args.between(self.dense)
             between = _between(*constant((state, step.h, z))) * weights
             counted = jnp.where(jnp.abs(between) > jnp.abs(scaled), between, scaled)
         smallest = is_smallest(t0, t1)
@@ -245,7 +246,7 @@ def _solve(step: _Step, state: _State, smallest: Any, tol: Tolerances) -> Any:
     smallest step with new ones for each correction.
     """
     h, predicted = step.h, _predicted(state, step.h)
-    scale = step.pencil.weights(h, tol.raised(True)) / tol.scale(step.y0)
+    scale = step.pencil.weights(h, tol.raised()) / tol.scale(step.y0)
 
     def attempt(carry: Any) -> Any:
         tries, fresh, before, jacobians, factors, _ = carry

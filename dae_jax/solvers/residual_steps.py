@@ -31,8 +31,9 @@ class AbstractResidualSolver(diffrax.AbstractAdaptiveSolver):
     round-off for fixed steps.
     """
 
-    # Up to which index the method converges.
+    # Up to which index the method converges, and takes the equations as they are written where nothing else is asked for.
     highest_index: eqx.AbstractClassVar[int]
+    default_index: eqx.AbstractClassVar[int]
 
     rtol: Any = None
     atol: Any = None
@@ -60,13 +61,11 @@ class Tolerances(NamedTuple):
     corrections: int
     patient: bool
 
-    def raised(self, dense: bool) -> Any:
-        """How much more than that at the ends of steps the error of variables of index 2 and higher counts, where values
-        between steps are wanted: their round-off grows with the same power of 1/h.
+    def raised(self) -> Any:
+        """How much more than h^(k−1) the error of a variable of index k > 1 counts on the way between the ends of a step: its
+        round-off grows like 1/h^(k−1).
         """
-        if not dense:
-            return 1.0
-        smallest = jnp.max(self.rtol) + jnp.max(self.atol)
+        smallest = jnp.max(self.rtol)
         return smallest / (NOISY * jnp.finfo(smallest.dtype).eps)
 
     def scale(self, *ys: Float[Array, " n"]) -> Float[Array, " n"]:

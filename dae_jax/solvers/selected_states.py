@@ -48,6 +48,7 @@ class SelectedResiduals(AbstractResidualSolver):
     solver: AbstractResidualSolver = dataclasses.field(kw_only=True)
 
     highest_index = 1
+    default_index = 1
 
     @property
     def interpolation_cls(self) -> Any:
