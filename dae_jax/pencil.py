@@ -26,6 +26,7 @@ from .structure import (
     sigma_method,
     signature,
 )
+from .systems import ConstrainedSystem
 
 
 GAUSS_NEWTON = 5
@@ -178,14 +179,22 @@ class Pencil(eqx.Module):
         size = jnp.minimum(jnp.abs(h), 1)
         indices = np.array(self.outline.indices)
         weights = powers(size, tuple(np.maximum(indices - 1, 0).tolist()))
-        seen = (indices > 1) & self.form.shown
+        seen = self._followed
         return weights * jnp.where(seen, jnp.clip(raised, 1, 1 / size), 1) if seen.any() else weights
 
     def between(self, dense: bool) -> Bool[np.ndarray, " n"]:
         """Of which variables the way between the ends of a step counts: the user's of index 2 and higher, which follow from
         derivatives; with `dense` all of the user's.
         """
-        return self.form.shown & (dense | (np.array(self.outline.indices) > 1))
+        return self.form.shown & (dense | self._followed)
+
+    @property
+    def _followed(self) -> Bool[np.ndarray, " n"]:
+        """Which of the user's variables are of index 2 and higher, those of a mechanism apart: its velocities follow from
+        positions that are controlled.
+        """
+        mechanism = isinstance(self.form, ResidualForm) and isinstance(self.form.system, ConstrainedSystem)
+        return self.form.shown & (np.array(self.outline.indices) > 1) & (not mechanism)
 
     def counted(self, dense: bool) -> Bool[np.ndarray, " n"]:
         """Which variables are of index 0 or 1, or seen by the user where values between steps are wanted."""
