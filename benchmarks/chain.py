@@ -7,7 +7,7 @@ from . import timing
 
 SIZES = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 QUICK_SIZES = (4, 16)
-PATIENCE = 20.0  # a peer whose first call took longer than this, in s, is not asked for a longer chain
+COMPACTION_THRESHOLD = 20.0  # a peer whose first call took longer than this, in s, is not asked for a longer chain
 
 
 def run(peers, repeats, quick):
@@ -28,7 +28,7 @@ def run(peers, repeats, quick):
             except Exception as error:  # a peer that fails is a row, not the end of the table
                 row["failure"] = f"{type(error).__name__}: {error}".splitlines()[0][:80]
                 tired.add(peer.name)
-            if row.get("first", 0) > PATIENCE:
+            if row.get("first", 0) > COMPACTION_THRESHOLD:
                 tired.add(peer.name)
         for name, measured in timing.measure_together(solves, repeats).items():
             found[name]["time"] = measured

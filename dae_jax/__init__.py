@@ -6,6 +6,7 @@ from typing import Any as _Any
 
 from .analyse import Structure as Structure, analyse as analyse
 from .baumgarte_loss import BaumgarteLoss as BaumgarteLoss, baumgarte_loss as baumgarte_loss
+from .compiler import configure as configure
 from .diagnostics import (
     Drift as Drift,
     EquationDrift as EquationDrift,
@@ -31,7 +32,6 @@ from .formulations import (
 )
 from .initialise import consistent_state as consistent_state
 from .jumps import Jump as Jump
-from .kernels import configure as configure
 from .solution import RESULTS as RESULTS, DAESolution as DAESolution
 from .solve import daesolve as daesolve
 from .solvers import (

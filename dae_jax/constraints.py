@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .kernels import scalarise, subroutine
+from .compiler import scalarise, subroutine
 from .linalg import fixed_point, implicit_root, relative_change, solve
 from .normals import (
     SPARSE_FROM,

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from .checks import refuse_bad_start, refuse_no_time
+from .compiler import equations, hindrances, one_kernel_enabled, without_checks
 from .constraints import MechanicalODE
 from .formulations import AbstractFormulation, DummyDerivatives, ReducedResidual, Residual
-from .kernels import equations, hindrances, one_kernel_enabled, without_checks
 from .linalg.semidefinite import LOOPED, UNROLLED
 from .normals import SparseNormals
 from .pencil import Pencil

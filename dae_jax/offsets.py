@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .kernels import Polynomial, polynomials
+from .compiler import Polynomial, polynomials
 from .structure import (
     SigmaAnalysis,
     StructurallySingular,
@@ -110,7 +110,7 @@ def find_offsets(form: Form, dtype: Any) -> Offsets:
     Where u with constant entries makes uᵀ ∂F̄ᵢ/∂xⱼ^(dⱼ−cᵢ) = 0, one of the equations with the smallest offset c among those
     with uᵢ ≠ 0 is replaced by Σ uᵢ dᵏF̄ᵢ/dtᵏ, k = cᵢ − c, in which the cancelling terms are gone. Again until there is no such
     u: the degrees of freedom become fewer each time. What cancels is read from the equations, see
-    `dae_jax.kernels.polynomials`.
+    `dae_jax.compiler.jaxprs.polynomials`.
 
     Errors: `ValueError` for a structurally singular system, naming its equations and variables; `NotImplementedError` for a
     primitive that structural analysis does not know.

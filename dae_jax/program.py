@@ -13,10 +13,10 @@ import numpy as np
 import optimistix
 
 from .checks import is_saved_part, saved_parts
+from .compiler import PullBack, inexact, one_kernel, one_kernel_enabled, waiting
 from .formulations import AbstractFormulation, Residual
 from .initialise import look_at_end, look_at_start
 from .jumps import Jump, refuse_wrong_event, solve_with_jumps
-from .kernels import PullBack, inexact, one_kernel, one_kernel_enabled, waiting
 from .linalg import rms_norm
 from .normals import Rank
 from .regularity import COARSE

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import dae_jax
-from dae_jax.kernels import polynomials, scalarise
-from dae_jax.kernels.native import compiled, hindrances
+from dae_jax.compiler import polynomials, scalarise
+from dae_jax.compiler.lower import compiled, hindrances
 from dae_jax.structure import dependence
 
 

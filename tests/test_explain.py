@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import dae_jax
-from dae_jax.kernels import kernel_call
+from dae_jax.compiler import kernel_call
 from dae_jax.scenes import SCENES, chain
 from tests.methods import METHODS, Method
 

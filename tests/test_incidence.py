@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from dae_jax.kernels import gathered
+from dae_jax.compiler import gathered
 from dae_jax.structure import dependence, sigma_method, signature
 from dae_jax.structure.incidence import CALLS, CONTROL, RULES
 

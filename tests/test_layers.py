@@ -11,7 +11,7 @@ import pytest
 
 PACKAGE = Path(__file__).parent.parent / "dae_jax"
 LAYERS = (
-    {"interrupts", "kernels", "linalg", "progress", "structure"},
+    {"compiler", "interrupts", "linalg", "progress", "structure"},
     {
         "constraints",
         "initialise",
@@ -92,6 +92,10 @@ class TestEdges:
             if name not in LAYER or LAYER[name] > LAYER[unit_of(path)]
         }
         assert not upward
+
+    def test_compiler_knows_nothing_of_the_rest(self, path: Path):
+        if unit_of(path) == "compiler":
+            assert not edges(path)
 
     def test_siblings(self, path: Path):
         allowed = {"formulations": "solvers", "solvers": "formulations"}

@@ -8,7 +8,7 @@ import numpy as np
 import optimistix
 import pytest
 
-from dae_jax.kernels import hindrances
+from dae_jax.compiler import hindrances
 from dae_jax.linalg import SmallCholesky, SmallLU, elimination, newton, rms_norm, semidefinite_solve, solve, tearing
 from dae_jax.linalg.semidefinite import LOOPED, UNROLLED
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import dae_jax
-from dae_jax.kernels import one_kernel
+from dae_jax.compiler import one_kernel
 
 
 X = jnp.array([9.81, 1.0])

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..kernels import scalarise, subroutine
+from ..compiler import scalarise, subroutine
 from .dense import LOOPED, UNROLLED, solve
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from ..kernels import is_large, scalarise, subroutine
+from ..compiler import is_large, scalarise, subroutine
 
 
 # A larger state goes through the stages in a loop, as one with a large field does: compiling takes a quarter of the time.

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from ..kernels import is_large
+from ..compiler import is_large
 from ..linalg import implicit_root
 from .manifold import clock
 from .radau_coefficients import (

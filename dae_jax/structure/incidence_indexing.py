@@ -11,7 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ..kernels import gathered, windows
+from ..compiler import gathered, windows
 from .cells import Cells, as_sets, union, unless
 
 

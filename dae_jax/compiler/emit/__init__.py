@@ -1,0 +1,1 @@
+"""From LLVM's intermediate representation to machine code that XLA calls."""

@@ -1,0 +1,1 @@
+"""Jaxprs taken apart: walked, inlined, interpreted number by number."""

@@ -1,0 +1,135 @@
+"""Jaxprs without calls: what these do stands in their place, equal equations are there once, unused ones not at all."""
+
+from collections.abc import Hashable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
+
+from .scalar_interpreter import CALLS as OF_CALLS
+
+
+CALLS = {**OF_CALLS, "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "custom_vmap_call": "call"}
+# They give their first operand, or what is said here; others of equinox mean something to transformations only.
+_GIVES = {
+    **dict.fromkeys(
+        "copy copy_p stop_gradient nonbatchable nontraceable nondifferentiable_backward unvmap_max".split(), 0
+    ),
+    "select_if_vmap": 1,
+}
+_BY_OTHERS = frozenset({"unvmap_any", "unvmap_all", "maybe_set"})
+_SAME_IF_SO_SHAPED = frozenset({"reshape", "broadcast_in_dim", "convert_element_type", "squeeze", "expand_dims"})
+_COMMUTATIVE = frozenset({"add", "add_any", "mul", "max", "min", "and", "or", "xor", "eq", "ne"})
+KNOWN = CALLS.keys() | _GIVES.keys() | _BY_OTHERS | {"custom_linear_solve"}
+
+
+def inlined(closed: ClosedJaxpr) -> ClosedJaxpr:
+    """A jaxpr that computes the same."""
+    flat = _Flat()
+    inputs = [Var(v.aval) for v in closed.jaxpr.invars]
+    outputs = flat.run(closed, inputs)
+    needed, eqns = {v for v in outputs if isinstance(v, Var)}, []
+    for eqn in reversed(flat.eqns):
+        if eqn.effects or not needed.isdisjoint(eqn.outvars):
+            eqns.append(eqn)
+            needed.update(v for v in eqn.invars if isinstance(v, Var))
+    constants = [(v, x) for v, x in flat.constants.values() if v in needed]
+    jaxpr = closed.jaxpr.replace(constvars=[v for v, _ in constants], invars=inputs, outvars=outputs, eqns=eqns[::-1])
+    return ClosedJaxpr(jaxpr, [x for _, x in constants])
+
+
+class _Flat:
+    def __init__(self) -> None:
+        self.eqns: list[JaxprEqn] = []
+        self.constants: dict[int, tuple[Var, Any]] = {}
+        self._known: dict[Hashable, list[Any]] = {}
+
+    def run(self, closed: ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
+        """Writes down the equations of a jaxpr; gives the variables of its results."""
+        env: dict[Any, Any] = dict(zip(closed.jaxpr.invars, args, strict=True))
+        for v, x in zip(closed.jaxpr.constvars, closed.consts, strict=True):
+            env[v], _ = self.constants.setdefault(id(x), (Var(v.aval), x))
+        read = lambda v: v if isinstance(v, Literal) else env[v]
+        for eqn in closed.jaxpr.eqns:
+            env.update(zip(eqn.outvars, self._equation(eqn, list(map(read, eqn.invars))), strict=True))
+        return list(map(read, closed.jaxpr.outvars))
+
+    def _equation(self, eqn: JaxprEqn, args: list[Any]) -> list[Any]:
+        name, p = eqn.primitive.name, eqn.params
+        if name in CALLS:
+            inner = p[CALLS[name]]
+            return self.run(inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ()), args)
+        if name in _GIVES:
+            return [args[_GIVES[name]]]
+        if name == "custom_linear_solve":
+            return self.run(p["jaxprs"].solve, of_solve(p, args))
+        if name in _BY_OTHERS:
+            scalar = name != "maybe_set" and not args[0].aval.ndim
+            return args[:1] if scalar else self.run(_meaning(eqn), args)
+        if name == "while" and eqn.params["cond_jaxpr"].out_avals[0].shape:
+            eqn, args = _until_all_are_done(eqn, args)
+        if name in _SAME_IF_SO_SHAPED and _like(args[0].aval, eqn.outvars[0].aval):
+            return args[:1]
+        atoms = [_atom(x) for x in args]
+        key = (name, _key(eqn.params), frozenset(atoms) if name in _COMMUTATIVE else tuple(atoms))
+        found = None if eqn.effects or key[1] is None else self._known.get(key)
+        if found is None:
+            found = self._known[key] = [Var(v.aval) for v in eqn.outvars]
+            self.eqns.append(eqn.replace(invars=args, outvars=found))
+        return found
+
+
+def of_solve(p: Any, args: list[Any]) -> list[Any]:
+    """The operands of a `custom_linear_solve` that the function which finds the solution takes."""
+    start, count = sum(p["const_lengths"][:2]), p["const_lengths"].solve
+    return args[start : start + count] + args[sum(p["const_lengths"]) :]
+
+
+def _until_all_are_done(eqn: JaxprEqn, args: list[Any]) -> tuple[JaxprEqn, list[Any]]:
+    """A loop with a condition for each of several elements, as `vmap` makes it: what is done stays as it is."""
+    p = eqn.params
+    n, m = p["cond_nconsts"], p["body_nconsts"]
+    condition, body = map(jaxpr_as_fun, (p["cond_jaxpr"], p["body_jaxpr"]))
+
+    def any_goes_on(*xs: Any) -> Any:
+        return jnp.any(condition(*xs)[0])
+
+    def turn(*xs: Any) -> list[Any]:
+        carry = xs[n + m :]
+        (goes_on,) = condition(*xs[:n], *carry)
+        here = lambda x: jax.lax.broadcast_in_dim(goes_on, x.shape, range(goes_on.ndim))
+        return [jax.lax.select(here(x), y, x) for x, y in zip(carry, body(*xs[n:]), strict=True)]
+
+    structs = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in args]
+    params = {
+        **p,
+        "cond_jaxpr": jax.make_jaxpr(any_goes_on)(*structs[:n], *structs[n + m :]),
+        "body_jaxpr": jax.make_jaxpr(turn)(*structs),
+        "body_nconsts": n + m,
+    }
+    return eqn.replace(params=params), [*args[:n], *args]
+
+
+def _like(a: Any, b: Any) -> bool:
+    return a.shape == b.shape and a.dtype == b.dtype
+
+
+def _key(params: Any) -> Hashable:
+    key = tuple(sorted(params.items()))
+    try:
+        hash(key)
+    except TypeError:
+        return None
+    return key
+
+
+def _atom(x: Any) -> Hashable:
+    # By its text: 0 and −0 are equal, and not the same.
+    return (repr(x.val), str(x.aval)) if isinstance(x, Literal) else x
+
+
+def _meaning(eqn: Any) -> ClosedJaxpr:
+    """A primitive of equinox by others."""
+    structs = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
+    return jax.make_jaxpr(lambda *xs: eqn.primitive.impl(*xs, **eqn.params))(*structs)

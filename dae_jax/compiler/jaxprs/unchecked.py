@@ -1,0 +1,71 @@
+"""Functions without the checks that their caller has made already."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+from jax.extend.core import ClosedJaxpr, Jaxpr
+
+from .walk import equations_in
+
+
+def without_checks(fn: Callable[..., Any]) -> Callable[..., Any]:
+    """`fn` without `equinox.error_if`: for conditions that the caller has looked at already."""
+
+    def unchecked(*args: Any) -> Any:
+        jaxpr, out = jax.make_jaxpr(fn, return_shape=True)(*args)
+        results = _evaluate(jaxpr.jaxpr, jaxpr.consts, jax.tree.leaves(args))
+        return jax.tree.unflatten(jax.tree.structure(out), results)
+
+    return unchecked
+
+
+def _evaluate(jaxpr: Jaxpr, consts: Any, args: Any) -> list[Any]:
+    env = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *args], strict=True))
+
+    def read(v: Any) -> Any:
+        return v.val if isinstance(v, jax.extend.core.Literal) else env[v]
+
+    for eqn in jaxpr.eqns:
+        env.update(zip(eqn.outvars, _results(eqn, [read(v) for v in eqn.invars]), strict=True))
+    return [read(v) for v in jaxpr.outvars]
+
+
+def _results(eqn: Any, values: list[Any]) -> list[Any]:
+    """What an equation gives, without the checks in it."""
+    name = eqn.primitive.name
+    if name in ("jit", "pjit", "custom_jvp_call", "cond") and any(map(_is_check, equations_in(eqn))):
+        inner = _unchecked(eqn)
+        if inner is not None:
+            return _evaluate(inner.jaxpr, inner.consts, values[len(values) - len(inner.jaxpr.invars) :])
+        if name == "cond":
+            index, *operands = values
+            branches = [lambda *xs, b=b: _evaluate(b.jaxpr, b.consts, xs) for b in eqn.params["branches"]]
+            return jax.lax.switch(index, branches, *operands)
+    results = eqn.primitive.bind(*values, **eqn.primitive.get_bind_params(eqn.params))
+    return results if eqn.primitive.multiple_results else [results]
+
+
+def _unchecked(eqn: Any) -> ClosedJaxpr | None:
+    """What to run in place of a check, or of a call with checks in it; `None` for other equations."""
+    name = eqn.primitive.name
+    if name == "cond":
+        branches = eqn.params["branches"]
+        checked = [any(map(_is_check, b.jaxpr.eqns)) for b in branches]
+        return branches[checked.index(False)] if any(checked) and not all(checked) else None
+    if name in ("jit", "pjit"):
+        return eqn.params["jaxpr"]
+    if name == "custom_jvp_call" and any(map(_is_checking, eqn.params["call_jaxpr"].jaxpr.eqns)):
+        return eqn.params["call_jaxpr"]
+    return None
+
+
+def _is_checking(eqn: Any) -> bool:
+    return eqn.primitive.name == "cond" and _unchecked(eqn) is not None
+
+
+def _is_check(eqn: Any) -> bool:
+    if eqn.primitive.name != "pure_callback":
+        return False
+    callback = getattr(eqn.params["callback"], "callback_func", None)
+    return getattr(callback, "__module__", None) == "equinox._errors"

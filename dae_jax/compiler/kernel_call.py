@@ -1,0 +1,163 @@
+"""A traced function that is compiled to one kernel, as a primitive.
+
+What the kernel is made with is decided when the program that calls it is compiled, since until then a `vmap` may come:
+our own compiler where it can, else XLA's single kernels, else XLA as it is. A batch becomes lanes of vectors.
+"""
+
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
+from jax.interpreters import batching, mlir
+from jax.interpreters.partial_eval import dce_jaxpr
+
+from . import lower, waiting, xla_kernel
+from .jaxprs.scalar_interpreter import Unsupported
+from .jaxprs.unchecked import without_checks
+
+
+kernel_p = Primitive("one_kernel")
+kernel_p.multiple_results = True
+
+
+def hindrances(jaxpr: ClosedJaxpr) -> tuple[str, ...]:
+    """The names of the primitives in `jaxpr`, at any depth, that keep it from being one kernel; empty if none does."""
+    found = lower.hindrances(jaxpr)
+    return found if found == () else xla_kernel.hindrances(jaxpr)
+
+
+def as_kernel(fn: Callable[..., Any]) -> Callable[..., Any]:
+    """`fn` (pytrees of arrays to a pytree of arrays) as one kernel where it can be one; it has no derivative then."""
+    known: dict[Any, Any] = {}
+
+    def traced(*args: Any) -> Any:
+        leaves, treedef = jax.tree.flatten(args)
+        shapes = tuple(jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)) for x in leaves)
+        jaxpr, out = known.get((treedef, shapes)) or _traced(fn, jax.tree.unflatten(treedef, shapes))
+        if not any(isinstance(x, jax.core.Tracer) for x in jaxpr.consts):
+            known[treedef, shapes] = jaxpr, out
+        return jax.tree.unflatten(out, called(jaxpr, leaves))
+
+    return traced
+
+
+def _traced(fn: Callable[..., Any], shapes: Any) -> tuple[ClosedJaxpr, Any]:
+    """The jaxpr, and the tree of the results."""
+    # A kernel knows of no mesh; JAX would write down for each number that it lies on none.
+    with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
+        jaxpr, out = jax.make_jaxpr(without_checks(fn), return_shape=True)(*shapes)
+    return jaxpr, jax.tree.structure(out)
+
+
+def called(jaxpr: ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
+    """The results of a traced function, as one kernel where it can be one."""
+    # Tangents of integers are no numbers. XLA aborts where a parameter of a kernel is not used.
+    outvars = jaxpr.jaxpr.outvars
+    known = [v.aval.dtype != jax.dtypes.float0 for v in outvars]
+    needed, used = dce_jaxpr(jaxpr.jaxpr, known)
+    kernel = ClosedJaxpr(needed, jaxpr.consts)
+    constants = [x for x in jaxpr.consts if isinstance(x, jax.core.Tracer)]
+    if jaxpr.effects or constants or hindrances(kernel):
+        return jax.jit(jaxpr_as_fun(jaxpr))(*args)
+    numbers = iter(_bind(kernel, (), [x for x, u in zip(args, used, strict=True) if u]))
+    return [
+        next(numbers) if k else np.zeros(v.aval.shape, jax.dtypes.float0) for v, k in zip(outvars, known, strict=True)
+    ]
+
+
+def _bind(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Sequence[Any]) -> list[Any]:
+    return kernel_p.bind(*args, jaxpr=jaxpr, lanes=lanes)
+
+
+@kernel_p.def_impl
+def _(*args: Any, **params: Any) -> Any:
+    return jax.jit(lambda *xs: kernel_p.bind(*xs, **params))(*args)
+
+
+@kernel_p.def_abstract_eval
+def _(*args: Any, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> Any:
+    lead = next(((x.shape[0],) for x, b in zip(args, lanes or [False] * len(args), strict=True) if b), ())
+    return [v.aval.update(shape=(*lead, *v.aval.shape)) for v in jaxpr.jaxpr.outvars]
+
+
+def _lower(*args: Any, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> list[Any]:
+    began = waiting.begin()
+    try:
+        return _lowered(args, jaxpr, lanes)
+    finally:
+        if began:
+            waiting.end()
+
+
+def _lowered(args: Any, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> list[Any]:
+    if not lower.hindrances(jaxpr):
+        try:
+            return lower.compiled(jaxpr, lanes)(*args)
+        except Unsupported:
+            pass
+        except Exception as error:  # XLA can still do it
+            warnings.warn(f"A kernel is left to XLA, please report it: {error!r}", RuntimeWarning, stacklevel=2)
+    return _by_xla(jaxpr, lanes, args)
+
+
+def _by_xla(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Any) -> list[Any]:
+    if not lanes:
+        return xla_kernel.compiled(jaxpr)(*args)
+    axes = [0 if b else None for b in lanes]
+    in_step = jax.make_jaxpr(jax.vmap(jaxpr_as_fun(jaxpr), in_axes=axes))(*args)
+    if xla_kernel.qualifies(in_step, batched=True) or not xla_kernel.qualifies(jaxpr):
+        return xla_kernel.compiled(in_step, batched=True)(*args)
+    # One lane after another in one kernel: none waits for another.
+    return xla_kernel.compiled(jax.make_jaxpr(lambda *xs: _in_turn(jaxpr, lanes, xs))(*args))(*args)
+
+
+def _in_turn(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Any) -> list[Any]:
+    def one_lane(lane: Any) -> list[Any]:
+        of_lane = iter(lane)
+        return jaxpr_as_fun(jaxpr)(*(next(of_lane) if b else x for x, b in zip(args, lanes, strict=True)))
+
+    return jax.lax.map(one_lane, tuple(x for x, b in zip(args, lanes, strict=True) if b))
+
+
+def _plain(*args: Any, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> list[Any]:
+    fn: Callable[..., list[Any]] = jaxpr_as_fun(jaxpr)
+    return jax.vmap(fn, in_axes=[0 if b else None for b in lanes])(*args) if lanes else fn(*args)
+
+
+mlir.register_lowering(kernel_p, mlir.lower_fun(_lower, multiple_results=True), platform="cpu")
+mlir.register_lowering(kernel_p, mlir.lower_fun(_plain, multiple_results=True))
+
+
+def _batch(args: Any, dims: Any, *, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> tuple[list[Any], list[Any]]:
+    batched = [d is not None for d in dims]
+    args = [jnp.moveaxis(x, d, 0) if b else x for x, d, b in zip(args, dims, batched, strict=True)]
+    size = next(x.shape[0] for x, b in zip(args, batched, strict=True) if b)
+    # `jacfwd` asks that a value which does not depend on the direction stays unbatched.
+    differs = lower.varying(jaxpr, batched, in_memory=False)
+    if size == 1:  # the one direction of a derivative by a number
+        out = _bind(jaxpr, lanes, [x[0] if b else x for x, b in zip(args, batched, strict=True)])
+        out = [o[None] for o in out]
+    elif not lanes:
+        out = _bind(jaxpr, tuple(batched), args)
+    else:
+        inner = next(x.shape[b] for x, b, of in zip(args, batched, lanes, strict=True) if of)
+        joined = tuple(map(max, batched, lanes))
+        flat = [_joined(x, size, inner, b, of) for x, b, of in zip(args, batched, lanes, strict=True)]
+        out = [o.reshape(size, inner, *o.shape[1:]) for o in _bind(jaxpr, joined, flat)]
+    return [o if d else o[0] for o, d in zip(out, differs, strict=True)], [0 if d else None for d in differs]
+
+
+def _joined(x: Any, outer: int, inner: int, is_outer: bool, is_inner: bool) -> Any:
+    """Two batch axes as one."""
+    if not (is_outer or is_inner):
+        return x
+    own = x.shape[is_outer + is_inner :]
+    x = x.reshape(outer if is_outer else 1, inner if is_inner else 1, *own)
+    return jnp.broadcast_to(x, (outer, inner, *own)).reshape(outer * inner, *own)
+
+
+batching.primitive_batchers[kernel_p] = _batch

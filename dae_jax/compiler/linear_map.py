@@ -1,0 +1,144 @@
+"""Linear maps that are known together with their transposes and their derivatives, as a primitive.
+
+JAX has functions with a rule for forward derivatives and functions with one for reverse derivatives, but none with both.
+The derivative of a function in any mode is a linear map: applied to a direction it is the one, its transpose the other.
+"""
+
+import dataclasses
+import functools
+import operator
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+from .kernel_call import as_kernel
+
+
+Arrays = list[Any]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LinearMap:
+    """x ↦ A(at) x for lists of arrays, `apply(at, x)`.
+
+    `transposed()` is y ↦ A(at)ᵀ y. `change()` is how A(at) x changes with the inexact arrays in `at`, a linear map of their
+    changes at [*at, *x]. `inexact`: which arrays in `at` are.
+    """
+
+    apply: Callable[[Arrays, Arrays], Arrays]
+    inexact: Sequence[bool]
+    transposed: Callable[[], "LinearMap"]
+    change: Callable[[], "LinearMap"]
+
+    def __call__(self, at: Sequence[Any], x: Sequence[Any], shapes: Sequence[Any]) -> Arrays:
+        """A(at) x, whose arrays have the shapes and types of these."""
+        avals = tuple(jax.core.ShapedArray(jnp.shape(s), jnp.result_type(s)) for s in shapes)
+        return linear_p.bind(*at, *x, of=self, avals=avals)
+
+
+def is_inexact(x: Any) -> bool:
+    """Whether an array has derivatives."""
+    return jnp.issubdtype(jnp.result_type(x), jnp.inexact)
+
+
+def moved(fn: Callable[[Arrays], Arrays], at: Arrays, changes: Arrays) -> Arrays:
+    """How `fn(at)` changes with the inexact arrays in `at`."""
+
+    def of_inexact(*zs: Any) -> Arrays:
+        rest = iter(zs)
+        return fn([next(rest) if is_inexact(x) else x for x in at])
+
+    return jax.jvp(of_inexact, tuple(filter(is_inexact, at)), tuple(changes))[1]
+
+
+def forward_map(
+    fn: Callable[[Arrays, Arrays], Arrays],
+    inexact: Sequence[bool],
+    count: int,
+    transposed: Callable[[], LinearMap] | None = None,
+) -> LinearMap:
+    """`fn(at, x)`, linear in the `count` arrays x; its changes are forward derivatives of `fn`, and have no transpose."""
+    n = len(inexact)
+
+    def no_transpose() -> LinearMap:
+        raise NotImplementedError(
+            "The third derivative of a solve is a forward one: put `jax.jacfwd` outside, or use "
+            "`adjoint=diffrax.ForwardMode()` with `jax.jacfwd` throughout."
+        )
+
+    def changed(at: Arrays, changes: Arrays) -> Arrays:
+        return moved(lambda a: fn(a, at[n:]), at[:n], changes)
+
+    def change() -> LinearMap:
+        return forward_map(changed, [*inexact, *[True] * count], sum(inexact))
+
+    return LinearMap(as_kernel(fn), inexact, transposed or no_transpose, change)
+
+
+linear_p = Primitive("linear_map")
+linear_p.multiple_results = True
+
+
+def _evaluate(*args: Any, of: LinearMap, **_: Any) -> Arrays:
+    n = len(of.inexact)
+    return of.apply(list(args[:n]), list(args[n:]))
+
+
+linear_p.def_impl(_evaluate)
+linear_p.def_abstract_eval(lambda *_, avals, **__: list(avals))
+mlir.register_lowering(linear_p, mlir.lower_fun(_evaluate, multiple_results=True))
+
+
+def _jvp(primals: Any, tangents: Any, *, of: LinearMap, avals: Any) -> Any:
+    n = len(of.inexact)
+    changes = [t for t, i in zip(tangents[:n], of.inexact, strict=True) if i]
+    found = []
+    if not all(map(_is_zero, tangents[n:])):
+        found.append(of(primals[:n], _instantiated(tangents[n:]), avals))
+    if not all(map(_is_zero, changes)):
+        found.append(of.change()(primals, _instantiated(changes), avals))
+    return of(primals[:n], primals[n:], avals), [functools.reduce(operator.add, xs) for xs in zip(*found, strict=True)]
+
+
+def _is_zero(tangent: Any) -> bool:
+    return type(tangent) is ad.Zero
+
+
+def _instantiated(tangents: Sequence[Any]) -> Arrays:
+    return [jnp.zeros(t.aval.shape, t.aval.dtype) if _is_zero(t) else t for t in tangents]
+
+
+def _transpose(cotangents: Any, *args: Any, of: LinearMap, **_: Any) -> list[Any]:
+    n = len(of.inexact)
+    return [None] * n + of.transposed()(args[:n], _instantiated(cotangents), [x.aval for x in args[n:]])
+
+
+def _batch(args: Any, axes: Any, *, of: LinearMap, avals: Any) -> Any:
+    args = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(args, axes, strict=True)]
+    axes, n = [None if d is None else 0 for d in axes], len(of.inexact)
+    size = next(x.shape[0] for x, d in zip(args, axes, strict=True) if d is not None)
+    zeros = [0] * len(avals)
+    shapes = [v.update(shape=(size, *v.shape)) for v in avals]
+    return _batched(of, axes[:n], axes[n:], zeros)(args[:n], args[n:], shapes), zeros
+
+
+def _batched(of: LinearMap, at: list[Any], x: list[Any], y: list[Any]) -> LinearMap:
+    """A map for each element of a batch; an axis `None` is in `x` what all share, in `y` the sum of all."""
+
+    def apply(where: Arrays, xs: Arrays) -> Arrays:
+        found = jax.vmap(of.apply, in_axes=(at, x))(where, xs)
+        return [r if d == 0 else jnp.sum(r, 0) for r, d in zip(found, y, strict=True)]
+
+    def change() -> LinearMap:
+        return _batched(of.change(), [*at, *x], [d for d, i in zip(at, of.inexact, strict=True) if i], y)
+
+    return LinearMap(apply, of.inexact, lambda: _batched(of.transposed(), at, y, x), change)
+
+
+ad.primitive_jvps[linear_p] = _jvp
+ad.primitive_transposes[linear_p] = _transpose
+batching.primitive_batchers[linear_p] = _batch

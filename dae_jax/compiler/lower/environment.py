@@ -1,0 +1,71 @@
+"""A jaxpr that is being run."""
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Literal, Var
+
+from ..jaxprs.scalar_interpreter import Unsupported
+from .operands import retain
+from .primitives import Primitives
+
+
+# More operations than these in one loop would nest our own calls too deep.
+DEEP = 40
+
+
+class Environment:
+    """How far it has been run, and the values that are still needed."""
+
+    def __init__(self, run: Primitives, closed: ClosedJaxpr, args: list[Any]) -> None:
+        self.run, self.jaxpr = run, closed.jaxpr
+        self.values: dict[Any, Any] = {}
+        self._let_go: dict[Any, None] = {}
+        self._last: dict[Any, int] = {}
+        read = [v for eqn in self.jaxpr.eqns for v in eqn.invars] + self.jaxpr.outvars
+        self._uses = Counter(v for v in read if isinstance(v, Var))
+        for i, eqn in enumerate(self.jaxpr.eqns):
+            self._last.update((v, i) for v in eqn.invars if isinstance(v, Var))
+        self._last.update((v, len(self.jaxpr.eqns)) for v in self.jaxpr.outvars if isinstance(v, Var))
+        self._bind(self.jaxpr.invars, args, -1)
+        self._bind(self.jaxpr.constvars, list(map(run.constant, closed.consts)), -1)
+
+    def _bind(self, variables: Any, values: list[Any], now: int) -> None:
+        for v, x in zip(variables, values, strict=True):
+            if self._last.get(v, -1) > now:
+                x = self.run.code.materialised(x) if self._uses[v] > 1 or getattr(x, "depth", 0) > DEEP else x
+                self.values[v] = x
+                retain(x, 1)
+
+    def _read(self, v: Any) -> Any:
+        return self.run.constant(np.asarray(v.val, v.aval.dtype)) if isinstance(v, Literal) else self.values[v]
+
+    def operands(self, i: int) -> list[Any]:
+        """The operands of equation i; those that nothing else needs are let go."""
+        found = [self._read(v) for v in self.jaxpr.eqns[i].invars]
+        for v in dict.fromkeys(v for v in self.jaxpr.eqns[i].invars if isinstance(v, Var) and self._last[v] == i):
+            x = self.values.pop(v)
+            retain(x, -1)
+            self._let_go.update(dict.fromkeys(getattr(x, "buffers", ())))
+        return found
+
+    def give(self, i: int, values: list[Any]) -> None:
+        """The results of equation i."""
+        self._bind(self.jaxpr.eqns[i].outvars, values, i)
+        self.run.code.recycle(self._let_go)
+        self._let_go.clear()
+
+    def advance(self, start: int, stop: int) -> None:
+        """Runs the equations from `start` to `stop`."""
+        for i in range(start, stop):
+            self.give(i, self.run.equation(self.jaxpr.eqns[i], self.operands(i)))
+            if len(self.run.code.lines) > self.run.limit:
+                raise Unsupported("too many instructions")
+
+    def results(self) -> list[Any]:
+        """What the jaxpr returns, when all of it has been run."""
+        out = [self._read(v) for v in self.jaxpr.outvars]
+        for x in self.values.values():
+            retain(x, -1)
+        return out

@@ -1,0 +1,255 @@
+"""Arithmetic on single numbers as LLVM instructions, for one element or for several lanes at once.
+
+A number is a `Value`, the name of a result, or a numpy scalar where it is known. With `width` lanes a value is a vector
+that holds one number of each lane, or a single number that is the same for all.
+"""
+
+import contextlib
+import dataclasses
+import struct
+from collections import ChainMap
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import numpy as np
+
+from ..emit.machine import has_symbol, vector_function, vector_size
+from ..jaxprs.scalar_interpreter import Unsupported
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Value:
+    """The result of an instruction: its name, the LLVM type of one number, and whether each lane has its own."""
+
+    name: str
+    kind: str
+    lanes: bool = False
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Complex:
+    """A complex number in two."""
+
+    real: Any
+    imag: Any
+
+
+KINDS = {
+    "float64": "double", "float32": "float", "bool": "i1", "int8": "i8", "uint8": "i8", "int16": "i16",
+    "uint16": "i16", "int32": "i32", "uint32": "i32", "int64": "i64", "uint64": "i64",
+    "complex64": "", "complex128": "",
+}  # fmt: skip
+BYTES = {"double": 8, "float": 4, "i1": 1, "i8": 1, "i16": 2, "i32": 4, "i64": 8}
+
+
+def kind_of(dtype: Any) -> str:
+    """The LLVM type of a number."""
+    kind = KINDS.get(np.dtype(dtype).name)
+    if not kind:
+        raise Unsupported(str(dtype))
+    return kind
+
+
+def parts_of(dtype: Any) -> tuple[str, int]:
+    """The LLVM type of the parts of a number, and how many it has."""
+    dtype = np.dtype(dtype)
+    return (kind_of(f"float{4 * dtype.itemsize}"), 2) if dtype.kind == "c" else (kind_of(dtype), 1)
+
+
+class Instructions:
+    """A function's instructions, written one after another."""
+
+    def __init__(self, width: int = 1) -> None:
+        self.width = width
+        self.lines: list[str] = []
+        self.declared: dict[str, str] = {}
+        self.block = "entry"
+        self._count = 0
+        self._known: ChainMap[str, Value] = ChainMap()
+        self._scaled: dict[str, tuple[Value, float]] = {}
+
+    # Text
+
+    def name(self) -> str:
+        self._count += 1
+        return f"v{self._count}"
+
+    def type(self, kind: str, lanes: bool) -> str:
+        return f"<{self.width} x {kind}>" if lanes else kind
+
+    def write(self, text: str, kind: str, lanes: bool) -> Value:
+        """Appends an instruction with a result."""
+        name = f"%{self.name()}"
+        self.lines.append(f"{name} = {text}")
+        return Value(name, kind, lanes)
+
+    def pure(self, text: str, kind: str, lanes: bool) -> Value:
+        """An instruction whose result its operands decide: written once."""
+        found = self._known.get(text)
+        if found is None:
+            found = self._known[text] = self.write(text, kind, lanes)
+        return found
+
+    @contextlib.contextmanager
+    def scope(self) -> Iterator[None]:
+        """Instructions that may not be run: what is written here is not known afterwards."""
+        self._known = self._known.new_child()
+        yield
+        self._known = self._known.parents
+
+    def text(self, x: Any, kind: str, lanes: bool = False) -> str:
+        """An operand without its type."""
+        if isinstance(x, Value):
+            return self.in_lanes(x).name if lanes else x.name
+        if kind == "double" or kind == "float":
+            literal = f"0x{struct.pack('>d', float(x)).hex().upper()}"
+        else:
+            literal = ("true" if x else "false") if kind == "i1" else str(int(x))
+        return f"splat ({kind} {literal})" if lanes else literal
+
+    def operand(self, x: Any, kind: str, lanes: bool = False) -> str:
+        """An operand with its type."""
+        return f"{self.type(kind, lanes)} {self.text(x, kind, lanes)}"
+
+    def in_lanes(self, x: Value) -> Value:
+        """The same number in each lane."""
+        if x.lanes:
+            return x
+        vector = self.type(x.kind, True)
+        one = self.pure(f"insertelement {vector} poison, {x.kind} {x.name}, i64 0", x.kind, True)
+        return self.pure(
+            f"shufflevector {vector} {one.name}, {vector} poison, <{self.width} x i32> zeroinitializer", x.kind, True
+        )
+
+    def lane(self, x: Any, kind: str, k: int) -> Any:
+        """The number of one lane."""
+        if not isinstance(x, Value) or not x.lanes:
+            return x
+        return self.pure(f"extractelement {self.type(kind, True)} {x.name}, i64 {k}", kind, False)
+
+    def of_lanes(self, kind: str, numbers: Iterable[Any]) -> Value:
+        """One number for each lane."""
+        vector = "poison"
+        out = None
+        for k, number in enumerate(numbers):
+            out = self.write(
+                f"insertelement {self.type(kind, True)} {vector}, {self.operand(number, kind)}, i64 {k}", kind, True
+            )
+            vector = out.name
+        assert out is not None
+        return out
+
+    def function(self, name: str, result: str, *kinds: str) -> str:
+        """A function of LLVM or of the C library, declared."""
+        self.declared[name] = f"declare {result} @{name}({', '.join(kinds)})"
+        return f"@{name}"
+
+    # Instructions
+
+    def op(self, code: str, kind: str, *xs: Any, result: str | None = None) -> Value:
+        """An instruction whose operands have one type."""
+        lanes = any(isinstance(x, Value) and x.lanes for x in xs)
+        texts = [self.text(x, kind, lanes) for x in xs]
+        if code.partition(" ")[0] in ("fadd", "fmul"):
+            texts.sort()
+        return self.pure(f"{code} {self.type(kind, lanes)} {', '.join(texts)}", result or kind, lanes)
+
+    def scaled(self, x: Value, factor: float, kind: str) -> Value:
+        """x times a power of two, and x itself for x/2 + x/2."""
+        base, before = self._scaled.get(x.name, (x, 1.0))
+        factor *= before
+        if factor == 1:
+            return base
+        out = self.op("fmul contract", kind, base, factor)
+        self._scaled[out.name] = base, factor
+        return out
+
+    def intrinsic(self, name: str, kind: str, *xs: Any) -> Value:
+        lanes = any(isinstance(x, Value) and x.lanes for x in xs)
+        vector = self.type(kind, lanes)
+        suffix = kind.replace("double", "f64").replace("float", "f32")
+        full = f"llvm.{name}.{f'v{self.width}' if lanes else ''}{suffix}"
+        function = self.function(full, vector, *[vector] * len(xs))
+        return self.pure(
+            f"call {vector} {function}({', '.join(self.operand(x, kind, lanes) for x in xs)})", kind, lanes
+        )
+
+    def library(self, name: str, kind: str, *xs: Any) -> Value:
+        """A function of the C library, lane by lane where it has none for vectors."""
+        name = name if kind == "double" else f"{name}f"
+        if not has_symbol(name):
+            raise Unsupported(name)
+        function = self.function(name, kind, *[kind] * len(xs))
+        call = lambda ys: self.pure(
+            f"call {kind} {function}({', '.join(self.operand(y, kind) for y in ys)})", kind, False
+        )
+        if not any(isinstance(x, Value) and x.lanes for x in xs):
+            return call(xs)
+        many = vector_function(name, len(xs)) if kind == "double" else None
+        if many is not None:
+            return self._by_vectors(many, kind, xs)
+        return self.of_lanes(kind, [call([self.lane(x, kind, k) for x in xs]) for k in range(self.width)])
+
+    def _by_vectors(self, name: str, kind: str, xs: tuple[Any, ...]) -> Value:
+        """A function for vectors of the machine's size."""
+        size = vector_size()
+        vector = f"<{size} x {kind}>"
+        function = self.function(name, vector, *[vector] * len(xs))
+        whole, out = self.type(kind, True), ""
+        for first in range(0, self.width, size):
+            lanes = f"<{size} x i32> <{', '.join(f'i32 {first + k}' for k in range(size))}>"
+            parts = [
+                self.pure(f"shufflevector {self.operand(x, kind, True)}, {whole} poison, {lanes}", kind, True)
+                for x in xs
+            ]
+            found = self.pure(f"call {vector} {function}({', '.join(f'{vector} {x.name}' for x in parts)})", kind, True)
+            if size == self.width:
+                return found
+            places = [str(k - first) if first <= k < first + size else "poison" for k in range(self.width)]
+            wide = f"<{self.width} x i32> <{', '.join(f'i32 {k}' for k in places)}>"
+            there = self.pure(f"shufflevector {vector} {found.name}, {vector} poison, {wide}", kind, True).name
+            if out:
+                kept = ", ".join(f"i32 {k + self.width if k >= first else k}" for k in range(self.width))
+                there = self.pure(
+                    f"shufflevector {whole} {out}, {whole} {there}, <{self.width} x i32> <{kept}>", kind, True
+                ).name
+            out = there
+        return Value(out, kind, True)
+
+    def any(self, x: Value) -> Value:
+        """Whether a condition holds in any lane."""
+        if not x.lanes:
+            return x
+        vector = self.type("i1", True)
+        function = self.function(f"llvm.vector.reduce.or.v{self.width}i1", "i1", vector)
+        return self.pure(f"call i1 {function}({vector} {x.name})", "i1", False)
+
+    def select(self, condition: Any, yes: Any, no: Any, kind: str) -> Any:
+        if yes is no:
+            return yes
+        if isinstance(yes, Complex) or isinstance(no, Complex):
+            (a, b), (c, d) = parts(yes), parts(no)
+            return Complex(self.select(condition, a, c, kind), self.select(condition, b, d, kind))
+        if not isinstance(condition, Value):
+            return yes if condition else no
+        lanes = any(isinstance(x, Value) and x.lanes for x in (condition, yes, no))
+        which = self.operand(condition, "i1", condition.lanes)
+        return self.pure(
+            f"select {which}, {self.operand(yes, kind, lanes)}, {self.operand(no, kind, lanes)}", kind, lanes
+        )
+
+    def copy(self, x: Any, kind: str) -> Value:
+        """A value in any case."""
+        return x if isinstance(x, Value) else Value(self.text(x, kind), kind)
+
+    def cast(self, code: str, x: Value, kind: str, joined: bool = False) -> Value:
+        """A number as one of another type; `joined`: the bits of all lanes as one number."""
+        lanes = x.lanes and not joined
+        return self.pure(f"{code} {self.type(x.kind, x.lanes)} {x.name} to {self.type(kind, lanes)}", kind, lanes)
+
+
+def parts(x: Any) -> tuple[Any, Any]:
+    """The real and the imaginary part of a number."""
+    if isinstance(x, Complex):
+        return x.real, x.imag
+    return (np.float64(x.real), np.float64(x.imag)) if np.iscomplexobj(x) else (x, np.float64(0))

@@ -1,0 +1,47 @@
+"""Arrays as the operands that hold them: one for each part of each entry, a complex number in two parts."""
+
+from typing import Any
+
+import numpy as np
+
+from ..jaxprs.scalar_interpreter import Unsupported, objects
+from .arrays import View
+from .instructions import Complex, Value, parts, parts_of
+from .memory import Memory
+
+
+def texts(code: Memory, aval: Any, x: np.ndarray, lanes: bool) -> list[str]:
+    """The operands of the entries; with `lanes` vectors, also of what is the same in all lanes."""
+    numbers = [y for e in x.ravel() for y in (parts(e) if np.dtype(aval.dtype).kind == "c" else (e,))]
+    if not lanes and any(isinstance(y, Value) and y.lanes for y in numbers):
+        raise Unsupported("a number of each lane where one for all is expected")
+    return [code.text(y, kind, lanes) for y, kind in zip(numbers, kinds_of(aval), strict=True)]
+
+
+def of_texts(names: list[str], aval: Any, lanes: bool) -> np.ndarray:
+    """Entries from the operands that hold them."""
+    values = [Value(name, kind, lanes) for name, kind in zip(names, kinds_of(aval), strict=True)]
+    if np.dtype(aval.dtype).kind == "c":
+        values = [Complex(*pair) for pair in zip(values[::2], values[1::2], strict=True)]
+    return objects(values, aval.shape)
+
+
+def kinds_of(aval: Any) -> list[str]:
+    """The LLVM types of an array's numbers, two for a complex one."""
+    kind, count = parts_of(aval.dtype)
+    return [kind] * (count * aval.size)
+
+
+def has_lanes(x: Any) -> bool:
+    """Whether an array's entries may differ from lane to lane."""
+    if isinstance(x, View):
+        return x.buffer.lanes or (isinstance(x.offset, Value) and x.offset.lanes)
+    return any(
+        isinstance(p, Value) and p.lanes for e in x.ravel() for p in (parts(e) if isinstance(e, Complex) else (e,))
+    )
+
+
+def retain(x: Any, by: int) -> None:
+    """Counts the variables that hold a view of a buffer."""
+    for buffer in getattr(x, "buffers", ()):
+        buffer.references += by

@@ -1,0 +1,185 @@
+"""A whole loop compiled into one kernel on the CPU, with its derivatives.
+
+XLA:CPU runs a loop body as a sequence of kernels and pays for each launch; for scenes of a few bodies the launches cost
+4 to 12 times the arithmetic.
+"""
+
+import contextlib
+import contextvars
+import os
+from collections.abc import Callable
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax._src import xla_bridge
+from jax.flatten_util import ravel_pytree
+
+from .kernel_call import as_kernel
+from .linear_map import Arrays, LinearMap, forward_map, is_inexact, moved
+
+
+_enabled: contextvars.ContextVar[bool] = contextvars.ContextVar("one_kernel", default=True)
+
+
+def configure(*, one_kernel: bool | None = None, process_wide: bool = False) -> contextlib.ExitStack:
+    """Settings of the compilation.
+
+    - `one_kernel`: switches one-kernel compilation on or off, at once; used in a `with` statement, until its end.
+    - `process_wide`: for programs that solve many small problems. Every small loop of the process is compiled to one
+      kernel, also those of other libraries, and a computation runs in the thread that calls it, which saves the 10 to
+      50 µs of handing it to another. Call it before JAX computes anything.
+
+    Errors: `RuntimeError` where JAX has computed something before a process-wide setting.
+    """
+    restore = contextlib.ExitStack()
+    if one_kernel is not None:
+        restore.callback(_enabled.reset, _enabled.set(one_kernel))
+    if process_wide:
+        _configure_process()
+    return restore
+
+
+def _configure_process() -> None:
+    if xla_bridge.backends_are_initialized():
+        raise RuntimeError(
+            "`configure(process_wide=True)` comes too late: JAX has started already. Call it right after the imports."
+        )
+    options = "xla_cpu_small_while_loop_byte_threshold=65536,xla_cpu_use_multi_output_fusion"
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_extra_options={options}"
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
+
+
+def one_kernel_enabled() -> bool:
+    """Whether solves that are traced now may become one kernel."""
+    return _enabled.get()
+
+
+PullBack = Callable[[Any, Any], list[Any]]
+
+
+def one_kernel(
+    fn: Callable[..., Any],
+    derivative: Literal["forward", "reverse", "any"] = "any",
+    pull_back: PullBack | None = None,
+    forward: Callable[..., Any] | None = None,
+) -> Callable[..., Any]:
+    """`fn` (pytrees of arrays to a pytree of arrays), compiled to one kernel on the CPU where it qualifies.
+
+    On another backend, or where `hindrances` finds a reason, it is `fn` itself. Under `vmap` the batched function is
+    looked at afresh. `derivative` says in which mode `fn` can be differentiated: its derivative is again one kernel
+    where it qualifies; with "any" it is the plain `fn` throughout.
+
+    - `pull_back(args, cotangent)`, with "reverse", gives the cotangents of those leaves of `args` that are inexact, where
+      a way is known that has forward derivatives.
+    - `forward`, with "reverse": the same function, with forward derivatives of any order, where `fn` has none.
+    """
+    if not _enabled.get() or jax.default_backend() != "cpu" or derivative == "any":
+        return fn
+    return _forward(fn) if derivative == "forward" else _reverse(fn, pull_back, forward or fn)
+
+
+def _reverse(fn: Callable[..., Any], pull_back: PullBack | None, forward: Callable[..., Any]) -> Callable[..., Any]:
+    def flat(*args: Any) -> Any:
+        leaves, treedef = jax.tree.flatten(args)
+        kernel = as_kernel(fn)
+
+        @jax.custom_jvp
+        def solve(*xs: Any) -> Any:
+            return kernel(*jax.tree.unflatten(treedef, xs))
+
+        @solve.defjvp
+        def _(xs: Any, dxs: Any) -> Any:
+            out = solve(*xs)
+            ys, of_ys = jax.tree.flatten(out)
+            push = _derivative(fn, pull_back, forward, treedef, list(map(is_inexact, xs)), of_ys, list(map(is_inexact, ys)))
+            found = iter(push(xs, [dx for x, dx in zip(xs, dxs, strict=True) if is_inexact(x)], inexact(ys)))
+            dys = [next(found) if is_inexact(y) else np.zeros(jnp.shape(y), jax.dtypes.float0) for y in ys]
+            return out, jax.tree.unflatten(of_ys, dys)
+
+        return solve(*leaves)
+
+    return flat
+
+
+def _derivative(
+    fn: Callable[..., Any],
+    pull_back: PullBack | None,
+    forward: Callable[..., Any],
+    of_xs: Any,
+    inexact_xs: list[bool],
+    of_ys: Any,
+    inexact_ys: list[bool],
+) -> LinearMap:
+    """dx ↦ J(x) dx, with its transpose and with the second derivative in both modes.
+
+    The second derivative is symmetric: how c·J(x) changes along u is Σₖ cₖ Hₖ u, and its transpose is itself.
+    """
+    n, count, results = len(inexact_xs), sum(inexact_xs), sum(inexact_ys)
+
+    def values(xs: Arrays) -> Arrays:
+        return inexact(forward(*jax.tree.unflatten(of_xs, xs)))
+
+    def pushed(xs: Arrays, dxs: Arrays) -> Arrays:
+        return moved(values, xs, dxs)
+
+    def pulled(xs: Arrays, cotangents: Arrays) -> Arrays:
+        rest = iter(cotangents)
+        cotangent = jax.tree.unflatten(of_ys, [next(rest) if i else None for i in inexact_ys])
+        return (pull_back or _plain_pull_back(fn))(jax.tree.unflatten(of_xs, xs), cotangent)
+
+    def pulled_forwards(xs: Arrays, cotangents: Arrays) -> Arrays:
+        """The same by one forward derivative for each number in `xs`."""
+        directions, unflatten = ravel_pytree([jnp.zeros_like(x) for x in inexact(xs)])
+        slope = lambda d: sum(jnp.sum(c * dy) for c, dy in zip(cotangents, pushed(xs, unflatten(d)), strict=True))
+        return unflatten(jax.vmap(slope)(jnp.eye(directions.size, dtype=directions.dtype)))
+
+    def bent(at: Arrays, dxs: Arrays) -> Arrays:
+        differentiable = pulled if pull_back else pulled_forwards
+        return moved(lambda xs: differentiable(xs, at[n:]), at[:n], dxs)
+
+    def pushed_apart(at: Arrays, dxs: Arrays) -> Arrays:
+        return moved(lambda xs: pushed(xs, at[n:]), at[:n], dxs)
+
+    def pulled_apart(at: Arrays, cotangents: Arrays) -> Arrays:
+        return bent([*at[:n], *cotangents], at[n:])
+
+    of_both = [*inexact_xs, *[True] * count]
+    push = LinearMap(as_kernel(pushed), inexact_xs, lambda: pull, lambda: apart)
+    pull = LinearMap(as_kernel(pulled), inexact_xs, lambda: push, lambda: bend)
+    bend = forward_map(bent, [*inexact_xs, *[True] * results], count, lambda: bend)
+    apart = forward_map(pushed_apart, of_both, count, lambda: forward_map(pulled_apart, of_both, results))
+    return push
+
+
+def _plain_pull_back(fn: Callable[..., Any]) -> PullBack:
+    def pull_back(args: Any, cotangent: Any) -> list[Any]:
+        leaves, treedef = jax.tree.flatten(args)
+        exact = [not is_inexact(x) for x in leaves]
+
+        def of_inexact(*zs: Any) -> list[Any]:
+            rest = iter(zs)
+            merged = [x if e else next(rest) for e, x in zip(exact, leaves, strict=True)]
+            return inexact(fn(*jax.tree.unflatten(treedef, merged)))
+
+        return list(jax.vjp(of_inexact, *inexact(args))[1](inexact(cotangent)))
+
+    return pull_back
+
+
+def inexact(tree: Any) -> list[Any]:
+    """The leaves that have derivatives."""
+    return list(filter(is_inexact, jax.tree.leaves(tree)))
+
+
+def _forward(fn: Callable[..., Any]) -> Callable[..., Any]:
+    @jax.custom_jvp
+    def solve(*args: Any) -> Any:
+        return as_kernel(fn)(*args)
+
+    @solve.defjvp
+    def _(primals: Any, tangents: Any) -> Any:
+        return _forward(lambda p, t: jax.jvp(fn, p, t))(primals, tangents)
+
+    return solve

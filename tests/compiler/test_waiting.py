@@ -1,0 +1,172 @@
+"""What keeps the first answer from being waited for: what is compiled, by whom, and that it is said."""
+
+import sys
+from typing import ClassVar
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dae_jax
+from dae_jax import scenes
+from dae_jax.compiler import waiting, without_checks, xla_kernel
+from dae_jax.compiler.emit import machine
+from dae_jax.compiler.lower import compiled, hindrances, module as compiler
+from dae_jax.compiler.lower.arrays import SMALL
+from dae_jax.compiler.lower.cost import extent
+from dae_jax.solve import prepared
+
+
+X = np.array([1.0, 2.0, -3.0])
+
+
+def repeated(x, count):
+    for _ in range(count):
+        x = jnp.sin(x) + x[::-1]
+    return x
+
+
+class TestExtent:
+    def test_what_moves_entries_takes_nothing(self):
+        moving = jax.make_jaxpr(lambda x: jnp.stack([x[::-1], x]).T.reshape(-1)[2:])(X)
+        assert extent(moving, [False])[0] == 0
+
+    def test_what_is_known_is_not_written(self, monkeypatch):
+        """The estimate knows of no zeros: between one and four times the limit the function is written to see."""
+        monkeypatch.setattr(compiler, "LIMIT", 500)
+        jaxpr = jax.make_jaxpr(lambda x: repeated(x, 10) + repeated(jnp.zeros(16), 30))(jnp.arange(16.0))
+        assert extent(jaxpr, [False])[0] > compiler.LIMIT
+        assert hindrances(jaxpr) == ()
+        assert hindrances(jax.make_jaxpr(lambda x: repeated(x, 40))(jnp.arange(16.0))) == ("size",)
+
+    def test_factorials_of_taylor_arithmetic_do_not_hinder(self):
+        jaxpr = jax.make_jaxpr(lambda x: x * jax.lax.exp(jax.lax.lgamma(4.0)))(X)
+        assert hindrances(jaxpr) == ()
+        np.testing.assert_allclose(compiled(jaxpr)(X)[0], 6 * X, rtol=1e-15)
+        assert hindrances(jax.make_jaxpr(jax.lax.lgamma)(X)) == ("lgamma",)
+
+
+class TestCheaperForms:
+    def test_a_large_module_is_compiled_without_passes(self, monkeypatch):
+        monkeypatch.setattr(machine, "HEAVY", 0)
+        monkeypatch.setattr(machine, "_optimise", lambda _: (_ for _ in ()).throw(AssertionError("passes were run")))
+        found = compiled(jax.make_jaxpr(lambda x: jnp.sum(jnp.sin(x) * jnp.cos(x)) + 0.731)(X))(X)
+        np.testing.assert_allclose(found[0], np.sum(np.sin(X) * np.cos(X)) + 0.731, rtol=1e-14)
+
+    def test_xla_makes_no_single_kernel_of_a_large_function(self, monkeypatch):
+        jaxpr = jax.make_jaxpr(lambda x: repeated(x, 20))(X)
+        assert xla_kernel.qualifies(jaxpr)
+        monkeypatch.setattr(xla_kernel, "LIMIT", 30)
+        assert xla_kernel.hindrances(jaxpr) == ("size",)
+        assert not xla_kernel.qualifies(jaxpr)
+
+
+class Clock:
+    """In place of `threading.Timer`: nothing happens before `pass_by`."""
+
+    timers: ClassVar[list["Clock"]] = []
+
+    def __init__(self, delay, action):
+        self.delay, self.action, self.done = delay, action, False
+        Clock.timers.append(self)
+
+    def start(self):
+        self.started = True
+
+    def cancel(self):
+        self.done = True
+
+    @classmethod
+    def pass_by(cls, seconds):
+        for timer in cls.timers:
+            if timer.started and not timer.done and timer.delay <= seconds:
+                timer.action()
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    Clock.timers = []
+    monkeypatch.setattr(waiting.threading, "Timer", Clock)
+    return Clock
+
+
+def solved(late=0.0, **options):
+    """A solve that nothing has compiled before; `late`: how much time passes by meanwhile."""
+
+    def force(t, q, v, args):
+        Clock.pass_by(late)
+        return jnp.array([0.0, 9.81])
+
+    system = dae_jax.ConstrainedSystem(force, lambda t, q, args: (q @ q - 1) / 2)
+    start = jnp.array([1.0, 0.0]), jnp.zeros(2)
+    solve = lambda: dae_jax.daesolve(system, diffrax.Euler(), 0.0, 0.1, 0.1, start, **options)
+    return solve(), solve()
+
+
+SYSTEM = dae_jax.ConstrainedSystem(lambda t, q, v, args: jnp.array([0.0, 9.81]), lambda t, q, args: (q @ q - 1) / 2)
+
+
+class TestNotice:
+    LINE = "dae_jax: compiling …\n"
+
+    def test_after_two_seconds_on_a_terminal(self, clock, capsys, monkeypatch):
+        monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+        solved(late=1.9)
+        assert capsys.readouterr().err == ""
+        solved(late=2.1)
+        assert self.LINE in capsys.readouterr().err
+        clock.pass_by(100.0)
+        assert capsys.readouterr().err == "", "no line once it is compiled"
+
+    def test_not_where_nobody_looks(self, clock, capsys):
+        solved(late=100.0)
+        assert capsys.readouterr().err == ""
+
+    def test_where_a_progress_meter_is_asked_for(self, clock, capsys):
+        meter = diffrax.TextProgressMeter()
+        solved(late=100.0, progress_meter=meter)
+        assert self.LINE in capsys.readouterr().err
+
+    def test_an_error_ends_the_wait(self, clock, capsys, monkeypatch):
+        monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+        waits = []
+
+        def refuse(*_):
+            waits.append(len(clock.timers))
+            raise ArithmeticError("no force")
+
+        system = dae_jax.ConstrainedSystem(refuse, lambda t, q, args: (q @ q - 1) / 2)
+        with pytest.raises(ValueError, match="no force"):
+            dae_jax.daesolve(system, diffrax.Euler(), 0.0, 0.1, 0.1, (jnp.array([1.0, 0.0]), jnp.zeros(2)))
+        clock.pass_by(100.0)
+        assert waits
+        assert capsys.readouterr().err == ""
+
+
+def test_stats_tell_the_time_to_compile():
+    first, second = solved()
+    assert first.stats["compile_seconds"] > 0
+    assert second.stats["compile_seconds"] == 0
+
+
+def test_inside_jit_there_is_no_time_to_tell():
+    def end():
+        sol = dae_jax.daesolve(SYSTEM, diffrax.Euler(), 0.0, 0.1, 0.1, (jnp.array([1.0, 0.0]), jnp.zeros(2)))
+        return sol.stats
+
+    assert "compile_seconds" not in jax.jit(end)()
+
+
+def test_dummy_derivatives_of_a_mechanism_are_not_left_to_xla():
+    """The double pendulum: estimated at more than is allowed, half of it zeros, with factorials in it."""
+    scene = scenes.double_pendulum()
+    solve, *inputs = prepared(
+        scene.system, diffrax.Tsit5(), 0.0, 1.0, None, scene.y0, None, dae_jax.DummyDerivatives(),
+        diffrax.SaveAt(t1=True), None, diffrax.RecursiveCheckpointAdjoint(), None, 4096, diffrax.NoProgressMeter(),
+    )  # fmt: skip
+    kernel, arrays = solve.kernel(*inputs, None)
+    jaxpr = jax.make_jaxpr(without_checks(kernel))(arrays)
+    assert extent(jaxpr, [v.aval.size > SMALL for v in jaxpr.jaxpr.invars])[0] > compiler.LIMIT
+    assert hindrances(jaxpr) == ()
