@@ -5,7 +5,7 @@ import os
 import sys
 from pathlib import Path
 
-from dae_jax.options import writable
+from dae_jax.app.options import writable
 
 from . import chain, cost, stiff, sweep, timing, work_precision
 from .peers import NAMES, PACKAGES, load

@@ -5,8 +5,8 @@ import importlib.metadata as _metadata
 from typing import Any as _Any
 
 from .analyse import Structure as Structure, analyse as analyse
-from .baumgarte_loss import BaumgarteLoss as BaumgarteLoss, baumgarte_loss as baumgarte_loss
 from .compiler import configure as configure
+from .consistent import consistent_state as consistent_state
 from .diagnostics import (
     Drift as Drift,
     EquationDrift as EquationDrift,
@@ -14,6 +14,7 @@ from .diagnostics import (
     energy as energy,
     multipliers as multipliers,
 )
+from .driver.resets import Jump as Jump
 from .explain import (
     MechanicalPlan as MechanicalPlan,
     Plan as Plan,
@@ -30,8 +31,6 @@ from .formulations import (
     Residual as Residual,
     StateSpace as StateSpace,
 )
-from .initialise import consistent_state as consistent_state
-from .jumps import Jump as Jump
 from .solution import RESULTS as RESULTS, DAESolution as DAESolution
 from .solve import daesolve as daesolve
 from .solvers import (
@@ -46,22 +45,28 @@ from .solvers import (
     TangentSpace as TangentSpace,
     Trapezoid as Trapezoid,
 )
-from .sweep import Grid as Grid, grid as grid, sweep as sweep
+from .studies.baumgarte_loss import BaumgarteLoss as BaumgarteLoss, baumgarte_loss as baumgarte_loss
+from .studies.sweep import Grid as Grid, grid as grid, sweep as sweep
+from .studies.tune import Tuned as Tuned, tune as tune
 from .systems import (
     ConstrainedSystem as ConstrainedSystem,
     ImplicitDAE as ImplicitDAE,
     SemiExplicitDAE as SemiExplicitDAE,
 )
-from .tune import Tuned as Tuned, tune as tune
 
 
-_MODULES = ("plotting", "reductions", "scenes")
+_MODULES = {
+    "compiler": ".compiler",
+    "plotting": ".app.plotting",
+    "reductions": ".studies.reductions",
+    "scenes": ".scenes",
+}
 
 
 def __getattr__(name: str) -> _Any:
     """Modules that are imported when they are used, and the version."""
     if name in _MODULES:
-        return _importlib.import_module(f".{name}", __name__)
+        return _importlib.import_module(_MODULES[name], __name__)
     if name == "__version__":
         return _metadata.version(__name__)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

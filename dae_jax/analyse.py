@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .offsets import Offsets, Slopes, find_offsets
-from .residual import ResidualForm
-from .states import counted, refuse_wrong_state
+from .equations.derivative_orders import Offsets, Slopes, find_offsets
+from .equations.residual_form import ResidualForm
+from .equations.taylor import total_derivatives
 from .structure import Block, block_triangular, pantelides
 from .systems import ConstrainedSystem, System
-from .taylor import total_derivatives
-from .user_functions import refuse_wrong_functions
+from .validate.states import counted, refuse_wrong_state
+from .validate.user_functions import refuse_wrong_functions
 
 
 # A system of more variables is summed up in words; its incidence matrix would not fit a page.

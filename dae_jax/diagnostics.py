@@ -12,12 +12,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .constraints import MechanicalODE
-from .residual_drift import EquationDrift, equation_drift
+from .equations.constraints import MechanicalODE
+from .equations.residual_drift import EquationDrift, equation_drift
 from .solution import DAESolution, without_padding
-from .states import brief, refuse_wrong_state, refuse_wrong_system
 from .systems import ConstrainedSystem, System
-from .user_functions import refuse_no_real_number, refuse_wrong_functions, returned
+from .validate.states import brief, refuse_wrong_state, refuse_wrong_system
+from .validate.user_functions import refuse_no_real_number, refuse_wrong_functions, returned
 
 
 class Drift(NamedTuple):

@@ -9,20 +9,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .checks import refuse_bad_start, refuse_no_time
 from .compiler import equations, hindrances, one_kernel_enabled, without_checks
-from .constraints import MechanicalODE
+from .driver.program import Solve
+from .driver.start import refuse_bad_start, refuse_no_time
+from .equations.constraint_jacobian import SparseNormals
+from .equations.constraints import MechanicalODE
+from .equations.linearised import Pencil
+from .equations.residual_form import ResidualForm
+from .equations.structural_ode import StructuralODE
 from .formulations import AbstractFormulation, DummyDerivatives, ReducedResidual, Residual
 from .linalg.semidefinite import LOOPED, UNROLLED
-from .normals import SparseNormals
-from .pencil import Pencil
-from .program import Solve
-from .residual import ResidualForm
 from .solution import precision_of
 from .solve import prepared
-from .states import counted
 from .systems import ConstrainedSystem
-from .underlying import StructuralODE
+from .validate.states import counted
 
 
 @dataclasses.dataclass(frozen=True)

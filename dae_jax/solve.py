@@ -8,8 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .checks import as_array, checked, refuse_bad_start, refuse_bad_times
-from .failures import OKAY, in_words, raised_in_the_program
+from .driver.failures import OKAY, in_words, raised_in_the_program
+from .driver.options import refuse_misfits, refuse_no_event, refuse_other_steps, refuse_wrong_options, takes_residuals
+from .driver.program import Program, Solve, run, split
+from .driver.resets import Jump, refuse_other_outputs
+from .driver.start import as_array, checked, refuse_bad_start, refuse_bad_times
+from .equations.constraint_jacobian import Rank
 from .formulations import (
     AbstractFormulation,
     Differentiation,
@@ -18,15 +22,11 @@ from .formulations import (
     Residual,
     why_not_as_written,
 )
-from .jumps import Jump, refuse_other_outputs
-from .normals import Rank
-from .program import Program, Solve, run, split
 from .solution import DAESolution
-from .solve_options import refuse_misfits, refuse_no_event, refuse_other_steps, refuse_wrong_options, takes_residuals
 from .solvers import SelectedResiduals, SelectedStates
-from .states import with_rates
 from .systems import ConstrainedSystem, System
-from .user_functions import not_finite, refuse_wrong_functions
+from .validate.states import with_rates
+from .validate.user_functions import not_finite, refuse_wrong_functions
 
 
 _ranks: dict[Program, Rank | None] = {}

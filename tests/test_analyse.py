@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import dae_jax
-from dae_jax.cli import main
-from dae_jax.offsets import find_offsets
-from dae_jax.residual import ResidualForm
+from dae_jax.app.cli import main
+from dae_jax.equations.derivative_orders import find_offsets
+from dae_jax.equations.residual_form import ResidualForm
 from dae_jax.scenes import SCENES, chain
 
 

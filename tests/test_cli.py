@@ -15,13 +15,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dae_jax import cli, compare, maps
-from dae_jax.cli import main
-from dae_jax.interrupts import interruptible
-from dae_jax.plotting import FILE_TYPES
+from dae_jax.app import cli, compare, maps
+from dae_jax.app.cli import main
+from dae_jax.app.interrupts import interruptible
+from dae_jax.app.plotting import FILE_TYPES
 
 
-ROOT = Path(cli.__file__).parent.parent
+ROOT = Path(cli.__file__).parents[2]
 
 
 def test_compare_writes_table_data_and_figures(tmp_path, capsys):
@@ -226,7 +226,7 @@ def test_every_type_of_picture_can_be_saved():
 
 def test_bench_says_where_the_benchmarks_are(monkeypatch, tmp_path, capsys):
     """As in an installed package, which has none."""
-    monkeypatch.setattr(cli, "__file__", str(tmp_path / "dae_jax" / "cli.py"))
+    monkeypatch.setattr(cli, "__file__", str(tmp_path / "dae_jax" / "app" / "cli.py"))
     assert main(["bench", "--help"]) == 0
     assert "part of the source repository" in capsys.readouterr().out
     with pytest.raises(SystemExit) as end:
@@ -246,7 +246,7 @@ def test_a_disk_that_is_full_is_one_line(monkeypatch, tmp_path, capsys):
     def full(*arguments):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("dae_jax.figures.write_data", full)
+    monkeypatch.setattr("dae_jax.app.figures.write_data", full)
     assert main(["compare", "pendulum", "--t1", "0.1", "--methods", "rattle", "--out", str(tmp_path)]) == 2
     assert "dae-jax: [Errno 28] No space left on device" in capsys.readouterr().err
 

@@ -200,7 +200,7 @@ def test_counts_agree_with_their_nouns():
 
 def test_modules_and_version_are_there_when_they_are_used():
     program = (
-        "import sys, dae_jax; assert not {'dae_jax.scenes', 'dae_jax.plotting', 'dae_jax.reductions'} & set(sys.modules); "
+        "import sys, dae_jax; assert not {'dae_jax.scenes', 'dae_jax.app.plotting', 'dae_jax.studies.reductions'} & set(sys.modules); "
         "dae_jax.scenes.pendulum; dae_jax.plotting.drift; dae_jax.reductions.final_state; print(dae_jax.__version__); "
         "assert {'scenes', '__version__'} <= set(dir(dae_jax))"
     )

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 import dae_jax
-from dae_jax import figures, plotting
-from dae_jax.compare import Effort, Row, chosen, measure, methods, solve
+from dae_jax import plotting
+from dae_jax.app import figures
+from dae_jax.app.compare import Effort, Row, chosen, measure, methods, solve
 from dae_jax.scenes import ANGLES, SCENES
 
 
@@ -224,7 +225,7 @@ def test_other_tolerances_compile_nothing(monkeypatch):
 
 
 def _compilations():
-    from dae_jax.program import _jitted
+    from dae_jax.driver.program import _jitted
 
     return _jitted._cache_size()
 

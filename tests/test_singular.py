@@ -8,8 +8,8 @@ import pytest
 
 import dae_jax
 from dae_jax import RESULTS, ConstrainedSystem
-from dae_jax.constraints import MechanicalODE
-from dae_jax.regularity import is_near_constraints
+from dae_jax.equations.constraints import MechanicalODE
+from dae_jax.equations.regularity import is_near_constraints
 from dae_jax.scenes import SCENES
 
 

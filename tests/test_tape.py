@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import dae_jax
+from dae_jax.driver.trajectory_adjoint import LARGEST_TAPE, can_be_taped
 from dae_jax.scenes import chain, pendulum
-from dae_jax.tape import LARGEST_TAPE, can_be_taped
 
 
 SCENE = pendulum()
@@ -56,7 +56,7 @@ def test_equals_diffrax_with_respect_to_everything(solver, saveat, steps):
 
 
 def test_is_used_where_it_should_be():
-    solve = dae_jax.program.Solve(
+    solve = dae_jax.driver.program.Solve(
         dae_jax.Differentiation(), dae_jax.DOP853(), diffrax.SaveAt(t1=True), diffrax.PIDController(1e-6, 1e-6),
         diffrax.RecursiveCheckpointAdjoint(), None, 1000, diffrax.NoProgressMeter(),
     )  # fmt: skip

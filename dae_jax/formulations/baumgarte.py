@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ..constraints import ManifoldODE
-from ..underlying import underlying_ode
+from ..equations.constraints import ManifoldODE
+from ..equations.structural_ode import underlying_ode
 from .differentiation import AbstractFormulation
 
 

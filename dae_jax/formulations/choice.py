@@ -8,8 +8,8 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import structural_rank
 
-from ..offsets import find_offsets
-from ..residual import Form, ResidualForm
+from ..equations.derivative_orders import find_offsets
+from ..equations.residual_form import Form, ResidualForm
 from ..structure import interpreted
 
 

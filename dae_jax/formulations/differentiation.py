@@ -6,8 +6,8 @@ from typing import Any, ClassVar
 import diffrax
 import equinox as eqx
 
-from ..constraints import ManifoldODE
-from ..underlying import underlying_ode
+from ..equations.constraints import ManifoldODE
+from ..equations.structural_ode import underlying_ode
 
 
 class AbstractFormulation(eqx.Module):

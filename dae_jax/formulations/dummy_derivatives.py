@@ -6,10 +6,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ..pencil import Pencil
-from ..reduced import ReducedForm
-from ..residual import ResidualForm
-from ..underlying import StructuralODE
+from ..equations.index1_form import ReducedForm
+from ..equations.linearised import Pencil
+from ..equations.residual_form import ResidualForm
+from ..equations.structural_ode import StructuralODE
 from .differentiation import Differentiation
 from .residual import Residual
 

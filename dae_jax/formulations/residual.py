@@ -5,8 +5,8 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..pencil import Pencil
-from ..residual import Form, ResidualForm
+from ..equations.linearised import Pencil
+from ..equations.residual_form import Form, ResidualForm
 from .differentiation import AbstractFormulation
 
 

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..constraints import MechanicalODE, at_one_instant
+from ..equations.constraints import MechanicalODE, at_one_instant
 from ..linalg import newton, semidefinite_solve
-from ..states import NUMBERS
+from ..validate.states import NUMBERS
 from .differentiation import AbstractFormulation
 
 

@@ -6,7 +6,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 
-from ..states import brief
+from ..validate.states import brief
 from .explicit import unrolled, with_landing
 from .manifold import AbstractManifoldSolver, clock, or_nan, outcome
 from .residual_steps import AbstractResidualSolver

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from ..linalg import newton
-from ..states import brief
+from ..validate.states import brief
 from .implicit import AbstractImplicitSolver, hermite, predictor, stage_end, stage_residual, vector_field
 from .manifold import AbstractManifoldSolver, clock, or_nan, outcome
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from ..states import brief
+from ..validate.states import brief
 from .explicit import Unrolled, identity, unrolled
 from .manifold import AbstractManifoldSolver, clock, or_nan, outcome
 

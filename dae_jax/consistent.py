@@ -1,0 +1,262 @@
+"""Consistent initial states: how far a state is off, and the nearest one that is not."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from .equations.constraint_jacobian import Rank, mass_solve
+from .equations.constraints import MechanicalODE
+from .equations.initial_rates import is_nonlinear, rates_of
+from .equations.linearised import Pencil
+from .equations.regularity import has_rank, is_near_constraints, mass_is_regular, weakest
+from .equations.residual_form import ResidualForm
+from .equations.structural_ode import StructuralODE
+from .linalg import fixed_point, implicit_root, relative_change
+from .systems import ConstrainedSystem, System
+from .validate.states import broadcast_to_state, refuse_wrong_state, with_rates
+from .validate.user_functions import refuse_wrong_functions
+
+
+# What part of the interval a solve that failed is looked on beyond its end; and the second and third power of it.
+AHEAD = 1e-3
+# A smallest pivot below this power of round-off is that of constraints that become dependent.
+SINGULAR = 3 / 8
+
+
+class Violation(eqx.Module):
+    """By how much a state (q, v) violates its constraints.
+
+    `residuals`: g and (ġ, h); `distances`: the same divided by the length of each constraint's gradient, that is about
+    how far the state is from satisfying it; `allowed`: the distance that counts as round-off of the user's numbers, for
+    each level.
+    """
+
+    residuals: tuple[Float[Array, " m"], Float[Array, " mp"]]
+    distances: tuple[Float[Array, " m"], Float[Array, " mp"]]
+    allowed: tuple[Float[Array, ""], Float[Array, ""]]
+
+    def consistent(self) -> Bool[Array, ""]:
+        """Whether every level is within `allowed`; false for NaN."""
+        within = [jnp.all(d <= a) for d, a in zip(self.distances, self.allowed, strict=True)]
+        return jnp.asarray(within[0] & within[1])
+
+    def message(self) -> str:
+        """Which equations are off, at which level and by how much."""
+        lines = []
+        names = (("position level", "g"), ("velocity level", "dg/dt, then h"))
+        for (level, symbol), residual, distance, allowed in zip(
+            names, self.residuals, self.distances, self.allowed, strict=True
+        ):
+            for i in np.flatnonzero(~(np.asarray(distance) <= np.asarray(allowed))):
+                lines.append(f"  {level}: 0 = constraint[{i}] ({symbol}) is off by {float(residual[i]):.6g}")
+        return "The initial state `y0` violates the constraints:\n" + "\n".join(lines)
+
+
+def violation(ode: MechanicalODE, t: Any, y: Any) -> Violation:
+    """How far the flat state y = (q, v) is from the manifold."""
+    q, v = y
+    root = jnp.finfo(q.dtype).eps ** 0.5
+    allowed = tuple(root * (1 + jnp.max(jnp.abs(x))) for x in (q, v))
+    return Violation(ode.invariants(t, y), ode.distances(t, y), allowed)
+
+
+class Unsolved(eqx.Module):
+    """What is left of the equations and the hidden ones for the best derivatives, and how much of it counts as round-off
+    of the user's numbers; whether `several` derivatives satisfy the equations.
+    """
+
+    residuals: Float[Array, " m"]
+    allowed: Float[Array, " m"]
+    equations: tuple[str, ...] = eqx.field(static=True)
+    several: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(False))
+
+    def consistent(self) -> Bool[Array, ""]:
+        """Whether every equation has a solution; false for NaN."""
+        return jnp.all(jnp.abs(self.residuals) <= self.allowed)
+
+    def message(self) -> str:
+        """Which equations are off, and by how much."""
+        off = np.flatnonzero(~(np.abs(np.asarray(self.residuals)) <= np.asarray(self.allowed)))
+        lines = [f"  0 = {self.equations[i]} is off by {float(self.residuals[i]):.6g}" for i in off]
+        return "The initial state `y0` violates the equations, whatever its derivatives:\n" + "\n".join(lines)
+
+
+def unsolved(system: System, t: Any, state: Any, args: Any) -> Unsolved:
+    """What no derivatives of a state make vanish of the equations of a system that is no mechanism."""
+    form = ResidualForm.of(system, t, state, args)
+    y = form.encode(state)
+    t = jnp.asarray(t, y.dtype)
+    pencil = Pencil.of(form, y)
+    if pencil.outline.hidden:
+        ode = StructuralODE.of(form, y.dtype, complete=True)
+        return _left_over(ode, t, ode.encode(t, state))
+    several = rates_of(form, t, y)[1] if is_nonlinear(form, y.dtype) else jnp.asarray(False)
+    yd = pencil.rates(t, y)
+    j, m = pencil.jacobians(t, y, yd)
+    size = lambda x: 1 + jnp.max(jnp.abs(x))
+    ones = jnp.ones_like(y)
+    terms = pencil.storage.apply(jnp.abs(j), size(y) * ones) + pencil.storage.apply(jnp.abs(m), size(yd) * ones)
+    return Unsolved(pencil.residual(t, y, yd), jnp.finfo(y.dtype).eps ** 0.5 * terms, form.equations, several)
+
+
+def _left_over(ode: StructuralODE, t: Any, y: Float[Array, " N"]) -> Unsolved:
+    terms = jnp.sum(jnp.abs(ode.normals(t, y)), 1) * (1 + jnp.max(jnp.abs(y)))
+    return Unsolved(ode.violations(t, y), jnp.finfo(y.dtype).eps ** 0.5 * terms, ode.invariant_names)
+
+
+def look_at_start(
+    system: System, t: Any, state: Any, args: Any, rank: int | Rank | None, invertible: bool
+) -> tuple[Int[Array, ""], Bool[Array, ""]]:
+    """What is wrong with a start: 0 for nothing, 1: it is inconsistent, 2: the constraints have not the given rank (`None`:
+    all are independent), 3: the masses, 4: several ẏ satisfy the equations; and whether nothing is wrong beyond doubt.
+    `invertible`: whether M must be.
+    """
+    if not isinstance(system, ConstrainedSystem):
+        left = unsolved(system, t, state, args)
+        consistent = left.consistent()
+        return jnp.where(consistent, jnp.where(left.several, 4, 0), 1), consistent & ~left.several
+    ode = MechanicalODE.of(system, t, state, args, rank)
+    y = ode.encode(state)
+    consistent, regular = violation(ode, t, y).consistent(), mass_is_regular(ode, y[0], invertible)
+    fits, surely = has_rank(ode, t, y, ode.rank)
+    wrong = jnp.where(regular, jnp.where(consistent, jnp.where(fits, 0, 2), 1), 3)
+    return wrong, (wrong == 0) & surely
+
+
+class End(eqx.Module):
+    """What a mechanism's state at the end of a solve says: whether it satisfies the constraints (see `is_near_constraints`)
+    and these nearly depend on each other; whether the masses are regular there, and also beyond, where a solve that failed
+    did not get.
+    """
+
+    near: Bool[Array, ""]
+    singular: Bool[Array, ""]
+    masses: Bool[Array, ""]
+    masses_ahead: Bool[Array, ""]
+
+
+def look_at_end(
+    system: System, t0: Any, start: Any, args: Any, rank: int | Rank | None, invertible: bool, end: Any, keeps: Any,
+    tolerances: Any, residual: bool,
+) -> End:  # fmt: skip
+    """The state (t, y) at the `end` of a solve."""
+    yes = jnp.asarray(True)
+    if not isinstance(system, ConstrainedSystem):
+        return End(yes, ~yes, yes, yes)
+    ode = MechanicalODE.of(system, t0, start, args, rank)
+    start, (t, end) = ode.encode(start), (end[0], ode.encode(end[1]))
+    near = is_near_constraints(ode, t, start, end, keeps, tolerances, residual)
+    singular = ~yes if ode.rank else weakest(ode, t, end) < jnp.finfo(t.dtype).eps ** SINGULAR
+    if not callable(system.mass):
+        return End(near, singular, yes, yes)
+    (q, v), finite = end, jnp.all(jnp.isfinite(end[0]))
+    regular = lambda q: mass_is_regular(ode, q, invertible) | ~finite
+    ahead = [regular(q + AHEAD**k * (t - t0) * v) for k in (1, 2, 3)]
+    return End(near, singular, regular(q), ahead[0] & ahead[1] & ahead[2])
+
+
+def consistent_state(
+    system: System, t0: Any, y0: Any, args: Any = None, *, fixed: Any = None, rates: Any = None, yd0: Any = None
+) -> Any:
+    """The nearest state that satisfies the equations and the hidden ones.
+
+    For a `ConstrainedSystem`, positions first: the q with g(t₀, q) = 0 nearest to q₀ in the metric of the mass matrix at
+    q₀; then the v with G v + g_t = 0 and h = 0 nearest to v₀ in the same metric. For other systems all entries count
+    alike, and the derivatives are whatever the equations ask for. Differentiable with respect to `y0` and `args`.
+
+    **Arguments**
+
+    - `fixed`: a pytree of booleans (or boolean arrays) with the structure of `y0`; entries marked true are kept, such as
+      the differential variables of a circuit.
+    - `rates`: ẏ in the structure of `y0`, where that is given: all 0 for a state of rest. It counts for the variables
+      whose derivative occurs in the equations. All entries of the state then count alike for mechanisms also.
+    - `yd0`: near which ẏ is looked for, for an `ImplicitDAE` that is nonlinear in it.
+
+    Errors: `ValueError` where no such state is found from here, naming the equations that remain off; NaN where the
+    arguments are traced.
+    """
+    refuse_wrong_state(system, y0)
+    system = with_rates(system, yd0, y0)
+    y0 = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
+    refuse_wrong_functions(system, t0, y0, args)
+    masks = jax.tree.map(lambda x: jnp.zeros_like(x, dtype=bool), y0)
+    if fixed is not None:
+        masks = jax.tree.map(lambda f: f.astype(bool), broadcast_to_state("fixed", fixed, y0, "booleans"))
+    if rates is not None:
+        rates = broadcast_to_state("rates", rates, y0, "numbers")
+        rates = jax.tree.map(lambda r, x: r.astype(x.dtype), rates, y0)
+    if isinstance(system, ConstrainedSystem) and rates is None:
+        found, fine, remains = _nearest_of_mechanism(system, t0, y0, args, masks)
+    else:
+        found, fine, remains = _nearest_of_any(system, t0, y0, args, masks, rates)
+    if not isinstance(fine, jax.core.Tracer) and not bool(fine):
+        said, instead = "The initial state `y0` violates", "No consistent state was found near `y0`; left over are"
+        raise ValueError(
+            remains.message().replace(said, instead).replace(", whatever its derivatives", "")
+            + "\nThe equations may contradict each other, or too many entries are fixed."
+        )
+    return found
+
+
+def _nearest_of_mechanism(system: ConstrainedSystem, t: Any, y0: Any, args: Any, masks: Any) -> Any:
+    ode = MechanicalODE.of(system, t, y0, args)
+    q, v = ode.encode(y0)
+    weights = tuple(jnp.where(mask, 0, 1).astype(q.dtype) for mask in ode.encode(masks))
+    y, fine, remains = _nearest(ode, jnp.asarray(t, q.dtype), (q, v), weights)
+    return ode.decode(t, y), fine, remains
+
+
+@eqx.filter_jit
+def _nearest_of_any(system: System, t: Any, y0: Any, args: Any, masks: Any, rates: Any) -> Any:
+    form = ResidualForm.of(system, t, y0, args)
+    values = form.encode(y0)
+    t = jnp.asarray(t, values.dtype)
+    ode = StructuralODE.of(form, values.dtype, complete=True)
+    freedom = jnp.where(form.encode(masks), 0, 1)
+    y = ode.start(t, values, freedom, None if rates is None else form.encode(rates))
+    remains = _left_over(ode, t, y)
+    fine = remains.consistent()
+    return jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), ode.decode(t, y)), fine, remains
+
+
+@eqx.filter_jit
+def _nearest(ode: MechanicalODE, t: Any, y: Any, weights: Any) -> Any:
+    params = (ode, t, y, weights)
+
+    def iterate(params: Any) -> Any:
+        def correct(x: Any) -> Any:
+            new = _improved(x, params)
+            return new, relative_change(new - x, x)
+
+        return fixed_point(correct, jnp.concatenate(params[2]), max_steps=100)
+
+    x, _ = implicit_root(lambda x, p: x - _improved(x, p), iterate, params)
+    q, v = jnp.split(x, 2)
+    remains = violation(ode, t, (q, v))
+    found = remains.consistent()
+    return jax.tree.map(lambda z: jnp.where(found, z, jnp.nan), (q, v)), found, remains
+
+
+def _improved(x: Float[Array, " 2n"], params: Any) -> Float[Array, " 2n"]:
+    """A Gauss–Newton step towards the constrained minimum of the distance to the given state."""
+    ode, t, (q0, v0), (wq, wv) = params
+    q, v = jnp.split(x, 2)
+    m = ode.holonomic
+    a = ode.constraint_jacobian(t, q, v)
+    metric = lambda w, rows: w[:, None] * mass_solve(ode.mass(q0), (rows * w).T)
+    g, _ = ode.invariants(t, (q, v))
+    if m:
+        q = q0 - _least_norm(a[:m], metric(wq, a[:m]), g + jnp.dot(a[:m], q0 - q))
+    _, h = ode.invariants(t, (q, v))
+    v = v0 - _least_norm(a, metric(wv, a), h + jnp.dot(a, v0 - v))
+    return jnp.concatenate([q, v])
+
+
+def _least_norm(a: Float[Array, "c n"], n: Float[Array, "n c"], b: Float[Array, " c"]) -> Float[Array, " n"]:
+    schur = jnp.dot(a, n)
+    cut = float(jnp.finfo(schur.dtype).eps) ** 0.5
+    return jnp.dot(n, jnp.dot(jnp.linalg.pinv(schur, rtol=cut, hermitian=True), b))

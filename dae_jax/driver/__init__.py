@@ -1,0 +1,1 @@
+"""One solve: traced, compiled, run, and what it says when it fails."""

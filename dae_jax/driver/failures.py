@@ -1,0 +1,92 @@
+"""How a solve that failed says so: the sentence, and how it gets out of a compiled program."""
+
+import logging
+import re
+from typing import Any
+
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from ..solution import RESULTS, DAESolution
+
+
+OKAY = tuple(int(code._value) for code in (RESULTS.successful, RESULTS.event_occurred))
+# Failures that are found at the start, whatever steps were taken.
+_AT_START = tuple(
+    int(code._value) for code in (RESULTS.inconsistent_start, RESULTS.dependent_constraints, RESULTS.no_finite_start)
+)
+
+
+class SolveFailed(RuntimeError):
+    """A solve failed in a compiled program (`jit`, `vmap`). JAX hands it on as the last line of an error of its own."""
+
+
+def in_words(sol: DAESolution) -> str | None:
+    """Why a solve failed, at which time and after how many steps; `None` where it did not."""
+    return _sentence(*map(np.asarray, _details(sol)))
+
+
+def _details(sol: DAESolution) -> tuple[Any, ...]:
+    return sol.result._value, sol.stats["end_time"], sol.t0, sol.t1, sol.stats["num_steps"]
+
+
+def _sentence(code: Any, end: Any, t0: Any, t1: Any, steps: Any) -> str | None:
+    """The sentence for numbers, or for arrays of a batch: that of the first of those that failed."""
+    failed = np.flatnonzero(~np.isin(code, OKAY))
+    if not failed.size:
+        return None
+    at = lambda x: np.broadcast_to(x, np.shape(code)).reshape(-1)[failed[0]]
+    said = RESULTS._index_to_message[int(at(code))]
+    if int(at(code)) not in _AT_START:
+        said += f" The solve from t = {at(t0):.6g} to {at(t1):.6g} ended at t = {at(end):.6g} after {at(steps)} steps."
+    if np.asarray(t0).dtype == np.float32:
+        said += (
+            " It ran in float32, which resolves 1.2e-07 of a number: for more, switch on float64 by "
+            '`jax.config.update("jax_enable_x64", True)` right after the imports.'
+        )
+    if np.size(code) > 1:
+        said = (
+            f"{failed.size} of a batch of {np.size(code)} solves failed, the first of them number {failed[0]}: {said}"
+        )
+    return said
+
+
+def raised_in_the_program(sol: DAESolution) -> DAESolution:
+    """`sol`, in a program in which it raises a `SolveFailed` where it is evaluated and has failed."""
+    okay = jnp.any(jnp.stack([sol.result._value == code for code in OKAY]))
+    arrays, rest = eqx.partition(sol, eqx.is_array)
+    details = jax.tree.map(jnp.asarray, lax.stop_gradient(_details(sol)))
+    return eqx.combine(_passed(arrays, ~okay, details), rest)
+
+
+# A custom derivative, so that the branch is none in a derivative.
+@eqx.filter_custom_jvp
+def _passed(arrays: Any, failed: Any, details: Any) -> Any:
+    shapes = jax.eval_shape(lambda: arrays)
+    fail = lambda: jax.pure_callback(_raise, shapes, *details, vmap_method="expand_dims")
+    return lax.cond(eqxi.unvmap_any(failed), fail, lambda: arrays)
+
+
+@_passed.def_jvp
+def _(primals: Any, tangents: Any) -> Any:
+    return _passed(*primals), tangents[0]
+
+
+def _raise(*details: Any) -> Any:
+    # JAX would print the traceback of this function before the error that has it.
+    logging.getLogger("jax._src.callback").addFilter(_without_ours)
+    raise SolveFailed(_sentence(*map(np.asarray, details)))
+
+
+def _without_ours(record: logging.LogRecord) -> bool:
+    return not (record.exc_info and isinstance(record.exc_info[1], SolveFailed))
+
+
+def sentence_of(error: BaseException) -> str | None:
+    """What a `SolveFailed` said that JAX hands on as `error`, without the place in a batch; `None` for other errors."""
+    _, found, sentence = str(error).rpartition(f"{SolveFailed.__name__}: ")
+    return re.sub(r"^\d+ of a batch of .*?: ", "", sentence).strip() if found else None

@@ -1,0 +1,234 @@
+"""Solves that start again: where a condition crosses zero, the state or the equations change."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from ..consistent import consistent_state
+from ..equations.structural_ode import underlying_ode
+from ..solution import RESULTS, DAESolution, precision_of
+from ..systems import System
+from ..validate.states import NUMBERS, brief, broadcast_to_state, describe
+from ..validate.user_functions import refuse_other_arguments, returned
+from .start import saved_parts
+
+
+# Entries of `stats` that do not add up over the parts of a solve.
+NO_COUNTS = ("max_steps", "end_time")
+
+
+class Jump(eqx.Module):
+    """An `event` after which the solve goes on: a stop that is hit, a diode that switches.
+
+    **Arguments**
+
+    - `condition(t, y, args, **kwargs)`: a real number; an event is where it crosses zero, located on the solver's dense
+      output.
+    - `jump(t, y, args) -> (y, args)`: the state and the `args` that the solve goes on with. The nearest consistent state to
+      it is taken, in the sense of `consistent_state`.
+    - `direction`: `True` for upcrossings only, `False` for downcrossings only.
+    - `fixed`: entries of the state that are kept when it is made consistent, as in `consistent_state`.
+    - `most`: how many jumps there may be; one more ends the solve with `RESULTS.too_many_jumps`, and so do jumps that pile
+      up at one time.
+
+    A solve with a `Jump` saves what `SaveAt(t0=..., ts=..., t1=..., fn=...)` asks for: at the time of a jump, the state
+    after it. `sol.stats["jumps"]` counts them, `sol.stats["jump_times"]` are their times, padded with infinity. As any
+    event, it is found where the condition has different signs at the two ends of a step: two crossings in one step are
+    none.
+    """
+
+    condition: Callable[..., Any]
+    jump: Callable[..., tuple[Any, Any]]
+    direction: bool | None = eqx.field(static=True, default=None)
+    fixed: Any = None
+    most: int = eqx.field(static=True, default=100)
+
+    def __check_init__(self) -> None:
+        for name in ("condition", "jump"):
+            if not callable(getattr(self, name)):
+                raise TypeError(f"`{name}` of Jump must be a function, but is {brief(getattr(self, name))}.")
+        if self.direction not in (None, True, False):
+            raise ValueError(
+                "`direction` of Jump must be True for upcrossings, False for downcrossings or None for both, but is "
+                f"{brief(self.direction)}."
+            )
+        if type(self.most) is not int or self.most < 1:
+            raise ValueError(f"`most` of Jump must be an integer of at least 1, but is {brief(self.most)}.")
+
+
+def refuse_wrong_event(event: Any, t: Any, y: Any, args: Any) -> None:
+    """Refuses functions of an event that cannot be called with (t, y, args), or do not return what they must."""
+    if event is None:
+        return
+    conditions = [event.condition] if isinstance(event, Jump) else jax.tree.leaves(event.cond_fn, is_leaf=callable)
+    for condition in conditions:
+        # A boolean that stays true is no event of which there is one.
+        _refuse_wrong_condition(condition, t, y, args, "f" if isinstance(event, Jump) else "fb")
+    if isinstance(event, Jump):
+        _refuse_wrong_jump(event, t, y, args)
+
+
+def _refuse_wrong_condition(condition: Any, t: Any, y: Any, args: Any, kinds: str) -> None:
+    refuse_other_arguments("condition(t, y, args, **kwargs)", condition, 3, terms=None, solver=None, t0=None, t1=None)
+    found = returned("condition(t, y, args, **kwargs)", condition, t, y, args)
+    fits = isinstance(found, NUMBERS) and jnp.shape(found) == ()
+    if not fits or np.dtype(jnp.result_type(found)).kind not in kinds:
+        raise ValueError(
+            "`condition(t, y, args, **kwargs)` must return a real number, whose zero is the event, but returns "
+            f"{describe(found)}."
+        )
+
+
+def _refuse_wrong_jump(event: Jump, t: Any, y: Any, args: Any) -> None:
+    found = returned("jump(t, y, args)", event.jump, t, y, args)
+    shapes = lambda tree: (jax.tree.structure(tree), [jnp.shape(x) for x in jax.tree.leaves(tree)])
+    if not isinstance(found, tuple | list) or len(found) != 2 or shapes(tuple(found)) != shapes((y, args)):
+        raise ValueError(
+            f"`jump(t, y, args)` must return (y, args), the state and the args to go on with, {describe((y, args))}, but "
+            f"returns {describe(found)}."
+        )
+    if event.fixed is not None:
+        broadcast_to_state("fixed", event.fixed, y, "booleans")
+
+
+def refuse_other_outputs(saveat: diffrax.SaveAt) -> None:
+    """Refuses what cannot be put together from the parts of a solve with jumps."""
+    parts = saved_parts(saveat)
+    if len(parts) != 1 or parts[0].steps or saveat.dense or saveat.solver_state or saveat.controller_state:
+        raise ValueError(
+            "A solve with a Jump saves SaveAt(t0=..., ts=..., t1=..., fn=...) only, no steps or dense output."
+        )
+
+
+class _FromStart(eqx.Module):
+    """± a condition whose value at the start is given."""
+
+    condition: Callable[..., Any]
+    sign: Any
+    t0: Any
+    level: Any
+
+    def __call__(self, t: Any, y: Any, args: Any, **kwargs: Any) -> Any:
+        return self.sign * jnp.where(t == self.t0, self.level, self.condition(t, y, args, **kwargs))
+
+
+class _Progress(NamedTuple):
+    """Where a solve stands: the start of the next part, what was saved so far, and how the last part ended; `level` is the
+    condition at the start of the last part.
+    """
+
+    t: Float[Array, ""]
+    y: Any
+    args: Any
+    count: Int[Array, ""]
+    times: Float[Array, " jumps"]
+    ts: Float[Array, " times"]
+    ys: Any
+    stats: Any
+    code: Int[Array, ""]
+    level: Float[Array, ""]
+
+
+def solve_with_jumps(
+    solve: Any, system: System, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, rank: int | None
+) -> tuple[DAESolution, Any]:
+    """What `solve` gives, part by part; `solve.event` is a `Jump`."""
+    jump, (output,) = solve.event, saved_parts(solve.saveat)
+    empty = jnp.zeros(0, t0.dtype)
+    wanted = jnp.concatenate(
+        [t0[None] if output.t0 else empty, empty if output.ts is None else output.ts, t1[None] if output.t1 else empty]
+    )
+    sign = jnp.where(t1 < t0, -1, 1).astype(t0.dtype)
+    resolution = float(jnp.finfo(t0.dtype).eps) ** 0.75
+    going = int(RESULTS.event_occurred._value)
+
+    def part(p: _Progress) -> tuple[DAESolution, Any, Any]:
+        level = _level_at_start(system, jump.condition, p.t, p.y, p.args, p.level, rank)
+        # A downcrossing, as bisection has to know which way it goes.
+        up = {True: -1, False: 1, None: jnp.sign(level)}[jump.direction]
+        event = diffrax.Event(
+            _FromStart(jump.condition, jnp.asarray(up, t0.dtype), p.t, level),
+            optimistix.Bisection(resolution, resolution, flip=True),
+            direction=False,
+        )
+        later = sign * jnp.maximum(sign * wanted, sign * p.t)
+        subs = {"wanted": dataclasses.replace(output, t0=False, t1=False, ts=later), "end": diffrax.SubSaveAt(t1=True)}
+        one = dataclasses.replace(solve, event=event, saveat=diffrax.SaveAt(subs=subs))
+        return *one(system, p.t, t1, dt0, p.y, p.args, rank), level
+
+    def advance(p: _Progress) -> _Progress:
+        sol, _, level = part(p)
+        end, reached = sol.ts["end"][-1], jax.tree.map(lambda y: y[-1], sol.ys["end"])
+        here = (sign * wanted >= sign * p.t) & (sign * wanted <= sign * end)
+        ts = jnp.where(here, wanted, p.ts)
+        ys = jax.tree.map(lambda a, b: jnp.where(here.reshape(-1, *(1,) * (a.ndim - 1)), a, b), sol.ys["wanted"], p.ys)
+        stats = {k: p.stats[k] + v for k, v in sol.stats.items() if k not in NO_COUNTS}
+        code = sol.result._value
+        # Jumps so close that their order is round-off are no events any more.
+        piled = (p.count > 0) & (sign * (end - p.t) <= 16 * resolution * (1 + jnp.abs(end)))
+        jumps, exhausted = code == going, piled | (p.count >= jump.most)
+        y, args = lax.cond(
+            jumps & ~exhausted,
+            lambda: _after(system, jump, end, reached, p.args),
+            lambda: (jax.tree.map(jnp.asarray, reached), p.args),
+        )
+        times = jnp.where((jnp.arange(jump.most) == p.count) & jumps & ~exhausted, end, p.times)
+        code = jnp.where(jumps & exhausted, RESULTS.too_many_jumps._value, code)
+        return _Progress(end, y, args, p.count + (jumps & ~exhausted), times, ts, ys, stats, code, level)
+
+    unknown = jnp.zeros_like(t0)
+    shape = jax.eval_shape(part, _Progress(t0, y0, args, *[None] * 6, unknown))[0]
+    unsaved = jax.tree.map(lambda x: jnp.full(x.shape, jnp.inf, x.dtype), shape.ys["wanted"])
+    stats = {k: jnp.zeros((), int) for k in shape.stats if k not in NO_COUNTS}
+    start = _Progress(
+        t0, y0, args, jnp.zeros((), int), jnp.full(jump.most, jnp.inf, t0.dtype),
+        jnp.full_like(wanted, jnp.inf), unsaved, stats, jnp.asarray(going, RESULTS.successful._value.dtype), unknown,
+    )  # fmt: skip
+    kind: Any = "checkpointed" if solve.derivative() == "reverse" else "lax"
+    most = {"max_steps": jump.most + 1} if kind == "checkpointed" else {}
+    p = eqxi.while_loop(lambda p: p.code == going, advance, start, kind=kind, **most)
+    stats = {"max_steps": solve.max_steps, **p.stats, "end_time": p.t, "jumps": p.count, "jump_times": p.times}
+    result = eqx.tree_at(lambda r: r._value, RESULTS.successful, p.code)
+    precision = precision_of(t0.dtype, solve.controller)
+    sol = DAESolution(t0, t1, p.ts, p.ys, None, stats, result, None, args, rank, precision)
+    refused = (
+        RESULTS.inconsistent_start,
+        RESULTS.dependent_constraints,
+        RESULTS.irregular_mass,
+        RESULTS.ambiguous_start,
+    )
+    return sol, ~jnp.any(jnp.stack([p.code == code._value for code in refused]))
+
+
+def _after(system: System, jump: Jump, t: Any, y: Any, args: Any) -> tuple[Any, Any]:
+    """The state and the args after a jump."""
+    y, new = jump.jump(t, y, args)
+    y = consistent_state(system, t, y, new, fixed=jump.fixed)
+    return y, jax.tree.map(lambda x, like: jnp.asarray(x, jnp.result_type(like)), new, args)
+
+
+def _level_at_start(
+    system: System, condition: Callable[..., Any], t: Any, y: Any, args: Any, before: Any, rank: int | None
+) -> Any:
+    """The condition at the start of a part; where this is zero, the sign with which it leaves zero. That is the sign with
+    which it came, −`before`, where its rate is not known.
+    """
+    value = jnp.asarray(condition(t, y, args))
+    # The state as it is: one made anew from the underlying ODE is NaN where the structure allows what the numbers do not.
+    z, ode = underlying_ode(system, t, y, args, rank)
+    of = lambda t, z: jnp.asarray(condition(t, ode.decode(t, z), args), t.dtype)
+    _, rate = jax.jvp(of, (t, z), (jnp.ones_like(t), ode.field(t, z)))
+    rate = jnp.where(jnp.isfinite(rate), rate, -before)
+    zero = float(jnp.finfo(t.dtype).eps) ** 0.5 * (1 + jnp.abs(rate))
+    leaves = (jnp.abs(value) <= zero) & (rate != 0)
+    return lax.stop_gradient(jnp.where(leaves, jnp.where(rate > 0, zero, -zero), value))

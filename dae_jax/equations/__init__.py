@@ -1,0 +1,1 @@
+"""A system at one instant, in the form that a method needs."""

@@ -1,0 +1,165 @@
+"""The linear algebra of a mechanism's constraints at one point: A, M⁻¹Aᵀ and (A M⁻¹Aᵀ)⁻¹, dense or sparse.
+
+Both classes are hashable descriptions without numbers. `at` linearises, and what it returns, the *normals*, is handed to
+the other methods; `ode` is the `MechanicalODE` that the constraints belong to.
+"""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ..linalg import Elimination, elimination, semidefinite_solve, take
+from ..structure import column_colouring, dependence, seed_matrix
+
+
+# Up to this many multiplications a product is written as a sum, which can become part of a kernel; a dot cannot.
+SUMMED = 4096
+# Systems with fewer constraints are dense: their elimination is straight-line code.
+SPARSE_FROM = 5
+
+
+# How many constraints are independent: of the holonomic ones, and of all.
+Rank = tuple[int, int]
+
+
+@dataclasses.dataclass(frozen=True)
+class DenseNormals:
+    """A as a matrix; `rank` where some of its rows depend on others."""
+
+    holonomic: int
+    nonholonomic: int
+    rank: Rank | None
+
+    def at(self, ode: Any, t: Any, q: Any, v: Any) -> tuple[Float[Array, "c n"], Float[Array, "n c"]]:
+        """A and M⁻¹Aᵀ: the normals in the metric of the mass matrix."""
+        a = ode.constraint_jacobian(t, q, v)
+        return a, mass_solve(ode.mass(q), a.T)
+
+    def along(self, ode: Any, normals: Any, x: Float[Array, " n"]) -> Float[Array, " c"]:
+        """A x."""
+        return matvec(normals[0], x)
+
+    def lift(self, ode: Any, normals: Any, mu: Float[Array, " c"]) -> Float[Array, " n"]:
+        """M⁻¹Aᵀ μ, of the first constraints where μ is shorter."""
+        return matvec(normals[1][:, : mu.shape[0]], mu)
+
+    def gram_solve(self, ode: Any, normals: Any, b: Float[Array, " c"]) -> Float[Array, " c"]:
+        """x with A M⁻¹Aᵀ x = b, of the first constraints where b is shorter."""
+        a, n = normals[0][: b.shape[0]], normals[1][:, : b.shape[0]]
+        gram = _matmul(a, n)
+        if self.rank is None:
+            return semidefinite_solve(gram, b)
+        # Which constraints depend on each other has nothing to do with their scale.
+        scale = unit_diagonal(gram)
+        rank = self.rank[b.shape[0] == self.holonomic + self.nonholonomic]
+        return scale * semidefinite_solve(gram * scale[:, None] * scale, scale * b, rank)
+
+    def lengths(self, normals: Any) -> Float[Array, " c"]:
+        """The length of each row of A."""
+        return jnp.sqrt(jnp.sum(normals[0] ** 2, 1))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SparseNormals:
+    """A by its nonzeros, for holonomic constraints and unit or diagonal masses.
+
+    A is compressed to C = A S, one directional derivative of the constraints a colour, in which row i has at most one
+    column `columns[c, i]` of colour c. The entries of A M⁻¹Aᵀ are then sums over the colours. Products with A and Aᵀ
+    are derivatives of the constraints themselves. Compared by identity: keep one for each pattern.
+    """
+
+    columns: Int[np.ndarray, "colours c"]
+    seeds: Float[np.ndarray, "colours n"]
+    gram: Elimination
+
+    def at(self, ode: Any, t: Any, q: Any, v: Any) -> tuple[Any, Float[Array, " n"], Float[Array, "colours c"]]:
+        """The point, and C there."""
+        tangent = lambda seed: jax.jvp(functools.partial(ode.constraint, t), (q,), (seed,))[1]
+        return jnp.asarray(t, q.dtype), q, jax.vmap(tangent)(jnp.asarray(self.seeds, q.dtype))
+
+    def along(self, ode: Any, normals: Any, x: Float[Array, " n"]) -> Float[Array, " c"]:
+        """A x."""
+        t, q, _ = normals
+        return jax.jvp(functools.partial(ode.constraint, t), (q,), (x,))[1]
+
+    def lift(self, ode: Any, normals: Any, mu: Float[Array, " c"]) -> Float[Array, " n"]:
+        """M⁻¹Aᵀ μ."""
+        t, q, _ = normals
+        _, transpose = jax.vjp(functools.partial(ode.constraint, t), q)
+        return mass_solve(ode.mass(q), transpose(mu)[0])
+
+    def gram_solve(self, ode: Any, normals: Any, b: Float[Array, " c"]) -> Float[Array, " c"]:
+        """x with A M⁻¹Aᵀ x = b."""
+        _, q, compressed = normals
+        mass = ode.mass(q)
+        rows, columns = self.gram.rows, self.gram.columns
+        weighted = compressed if mass is None else compressed * self._inverse_masses(mass)
+        shared = jnp.asarray(
+            (self.columns[:, rows] == self.columns[:, columns]) & (self.columns[:, rows] >= 0), q.dtype
+        )
+        at = lambda x, entries: jax.vmap(lambda row: take(row, entries))(x)
+        couplings = jnp.sum(shared * at(weighted, rows) * at(compressed, columns), 0)
+        return self.gram.solve(jnp.sum(weighted * compressed, 0), couplings, b)
+
+    def lengths(self, normals: Any) -> Float[Array, " c"]:
+        """The length of each row of A."""
+        return jnp.sqrt(jnp.sum(normals[2] ** 2, 0))
+
+    def _inverse_masses(self, mass: Float[Array, "..."]) -> Float[Array, "colours c"]:
+        return 1 / (jnp.broadcast_to(mass, (self.seeds.shape[1],))[np.maximum(self.columns, 0)])
+
+
+def sparse_normals(pattern: Bool[np.ndarray, "c n"]) -> SparseNormals | None:
+    """The sparse form for A with this pattern, where it takes fewer operations than the dense one."""
+    found = _sparse_normals(pattern.tobytes(), pattern.shape)
+    return found if found.gram.cost < len(pattern) ** 3 // 3 else None
+
+
+@functools.lru_cache(maxsize=64)
+def _sparse_normals(pattern: bytes, shape: tuple[int, int]) -> SparseNormals:
+    nonzero = np.frombuffer(pattern, bool).reshape(shape)
+    colours = column_colouring(nonzero)
+    columns = np.full((colours.max() + 1, shape[0]), -1)
+    for i, j in np.argwhere(nonzero):
+        columns[colours[j], i] = j
+    gram = nonzero.astype(np.int32)
+    return SparseNormals(columns, seed_matrix(colours).T, elimination(gram @ gram.T > 0))
+
+
+def constraint_pattern(constraint: Any, t: Any, q: Any) -> Bool[np.ndarray, "c n"] | None:
+    """Which constraint depends on which coordinate; `None` where that cannot be read off."""
+    try:
+        return dependence(lambda q: constraint(t, q), jax.ShapeDtypeStruct(q.shape, q.dtype), derivative=True)[0]
+    except NotImplementedError:
+        return None
+
+
+def mass_solve(mass: Float[Array, "..."] | None, x: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
+    """M⁻¹ x for M as `ConstrainedSystem.mass_matrix` gives it."""
+    if mass is None:
+        return x
+    if mass.ndim < 2:
+        return x / (mass[:, None] if mass.ndim and x.ndim == 2 else mass)
+    return semidefinite_solve(mass, x)
+
+
+def unit_diagonal(s: Float[Array, "c c"]) -> Float[Array, " c"]:
+    """d that makes the diagonal of diag(d) S diag(d) ±1, or leaves a 0."""
+    diagonal = jnp.abs(jnp.diagonal(s))
+    return 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
+
+
+def _matmul(a: Float[Array, "i j"], b: Float[Array, "j k"]) -> Float[Array, "i k"]:
+    if a.size * b.shape[1] > SUMMED:
+        return jnp.dot(a, b, precision=jax.lax.Precision.HIGHEST)
+    return jnp.sum(a[:, :, None] * b[None, :, :], 1)
+
+
+def matvec(a: Float[Array, "i j"], x: Float[Array, " j"]) -> Float[Array, " i"]:
+    """A x, as a sum, which can become part of a kernel."""
+    return jnp.sum(a * x, 1)

@@ -1,0 +1,367 @@
+"""The mathematics of a system at one instant: its underlying ODE and the manifold that this lives on.
+
+Differentiating a DAE often enough gives an underlying ODE ẏ = field(t, y) and the invariants H(t, y) = 0, the constraints
+and their hidden derivatives. Formulations and solvers see a system through this interface alone.
+"""
+
+import abc
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ..compiler import scalarise, subroutine
+from ..linalg import fixed_point, implicit_root, relative_change, solve
+from ..structure.layout import Layout
+from ..systems import ConstrainedSystem
+from .constraint_jacobian import (
+    SPARSE_FROM,
+    DenseNormals,
+    Rank,
+    SparseNormals,
+    constraint_pattern,
+    mass_solve,
+    matvec,
+    sparse_normals,
+    unit_diagonal,
+)
+
+
+def allowed_contradiction(dtype: Any) -> float:
+    """The part of the accelerations that dependent constraints ask for in which they may disagree."""
+    return max(1e-6, float(jnp.finfo(dtype).eps) ** 0.5)
+
+
+def at_one_instant(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Runs a method of an `eqx.Module` as scalar arithmetic where it is small, traced once for all its call sites."""
+
+    @functools.wraps(method)
+    def wrapped(*args: Any) -> Any:
+        arrays, static = eqx.partition(args, eqx.is_array)
+        leaves, treedef = jax.tree.flatten(static)
+        return _evaluate(method, tuple(leaves), treedef, arrays)
+
+    return wrapped
+
+
+@functools.partial(subroutine, static_argnums=(0, 1, 2))
+def _evaluate(method: Callable[..., Any], leaves: tuple[Any, ...], treedef: Any, arrays: Any) -> Any:
+    static = jax.tree.unflatten(treedef, leaves)
+    return scalarise(lambda arrays: method(*eqx.combine(arrays, static)))(arrays)
+
+
+class ManifoldODE(eqx.Module):
+    """An ODE ẏ = field(t, y) with invariants H(t, y) = 0: what a formulation makes of a DAE.
+
+    It travels through `diffrax.diffeqsolve` as `args`, so that its arrays can be batched over and differentiated. `y` is
+    a pytree of flat vectors.
+    """
+
+    @abc.abstractmethod
+    def field(self, t: Any, y: Any, feedback: Any = None) -> Any:
+        """The underlying ODE at (t, y). `feedback`, a function of H and its derivatives level by level, is added to the
+        highest derivative of each constraint, which is 0 otherwise (see `Baumgarte`).
+        """
+
+    @abc.abstractmethod
+    def invariants(self, t: Any, y: Any) -> tuple[Float[Array, " levels"], ...]:
+        """H(t, y), level by level: the constraints, then their hidden derivatives."""
+
+    @abc.abstractmethod
+    def normals(self, t: Any, y: Any) -> Any:
+        """Directions that span a complement of the manifold's tangent space at (t, y), and what is needed to use them."""
+
+    @abc.abstractmethod
+    def shift(self, y: Any, normals: Any, mu: Any) -> Any:
+        """y + N μ, with the normals N and a flat vector μ."""
+
+    @abc.abstractmethod
+    def restore(self, t: Any, y: Any, normals: Any) -> tuple[Any, Bool[Array, ""]]:
+        """The point y + N μ on the manifold at time t, and whether it was found."""
+
+    def project(self, t: Any, y: Any) -> tuple[Any, Bool[Array, ""]]:
+        """The nearest point on the manifold at time t, with the normals at y itself, and whether it was found."""
+        return self.restore(t, y, self.normals(t, y))
+
+    @abc.abstractmethod
+    def tangent(self, dy: Any, normals: Any) -> Any:
+        """The part of a derivative ẏ in the tangent space to which `normals` are normal."""
+
+    @abc.abstractmethod
+    def decode(self, t: Any, y: Any) -> Any:
+        """The state in the user's structure."""
+
+
+class MechanicalODE(ManifoldODE):
+    """The underlying ODE of a `ConstrainedSystem`: y = (q, v),
+
+        q̇ = v,   M v̇ + Aᵀλ = f,   A v̇ + γ = 0,   A = [∂g/∂q; ∂h/∂v],   γ = [d(Gv + g_t)/dt; dh/dt] at v̇ = 0,
+
+    with the invariants g = 0 (position level) and (Gv + g_t, h) = 0 (velocity level).
+    """
+
+    system: ConstrainedSystem
+    args: Any
+    layout: Layout = eqx.field(static=True)
+    holonomic: int = eqx.field(static=True)
+    nonholonomic: int = eqx.field(static=True)
+    depends_on_time: tuple[bool, bool] = eqx.field(static=True)
+    linear: DenseNormals | SparseNormals = eqx.field(static=True)
+
+    @classmethod
+    def of(
+        cls, system: ConstrainedSystem, t: Any, state: Any, args: Any, rank: int | Rank | None = None
+    ) -> "MechanicalODE":
+        """Finds, while tracing, what the system has and has not; `state` = (q, v) gives shapes and types only."""
+        q, v = state
+        system, args = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, (system, args))
+        layout = Layout.of(q)
+        g, g_uses_time = _outline(system.constraint, t, q, args)
+        h, h_uses_time = _outline(system.nonholonomic, t, q, v, args)
+        rank = system.rank if rank is None else rank
+        if isinstance(rank, int):
+            rank = (rank if not h else max(rank - h, 0), rank)
+        rank = None if rank == (g, g + h) else rank
+        ode = cls(system, args, layout, g, h, (g_uses_time, h_uses_time), DenseNormals(g, h, rank))
+        sparse = ode._sparse(t, layout.flatten(q)) if h == 0 and g >= SPARSE_FROM and rank is None else None
+        return ode if sparse is None else dataclasses.replace(ode, linear=sparse)
+
+    def _sparse(self, t: Any, q: Any) -> SparseNormals | None:
+        mass = jax.eval_shape(self.mass, q)
+        pattern = constraint_pattern(self.constraint, t, q) if mass is None or mass.ndim < 2 else None
+        return None if pattern is None else sparse_normals(pattern)
+
+    @property
+    def rank(self) -> Rank | None:
+        """How many constraints are independent, where some are redundant: of the holonomic ones, and of all."""
+        return self.linear.rank if isinstance(self.linear, DenseNormals) else None
+
+    def decode(self, t: Any, y: Any) -> Any:
+        q, v = y
+        return self.layout.unflatten(q), self.layout.unflatten(v)
+
+    def encode(self, state: Any) -> Any:
+        """The flat vectors (q, v)."""
+        q, v = state
+        return self.layout.flatten(q), self.layout.flatten(v)
+
+    # The system's functions on flat vectors
+
+    def force(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
+        """f(t, q, v)."""
+        flat = self.layout.unflatten
+        return self.layout.flatten(self.system.force(t, flat(q), flat(v), self.args)).astype(q.dtype)
+
+    def unchecked_mass(self, q: Float[Array, " n"]) -> Float[Array, "..."] | None:
+        """M(q) as the system has it: `None`, a vector (diagonal) or a matrix."""
+        mass = self.system.mass_matrix(self.layout.unflatten(q), self.args)
+        return None if mass is None else mass.astype(q.dtype)
+
+    def mass(self, q: Float[Array, " n"]) -> Float[Array, "..."] | None:
+        """M(q); NaN where a function has made a mass negative or a matrix asymmetric: methods use one triangle."""
+        mass = self.unchecked_mass(q)
+        if mass is None or not callable(self.system.mass):
+            return mass
+        sizes = jax.lax.stop_gradient(mass)
+        if mass.ndim < 2:
+            return jnp.where(sizes >= 0, mass, jnp.nan)
+        off = jnp.max(jnp.abs(sizes - sizes.T)) <= jnp.finfo(q.dtype).eps ** 0.75 * jnp.max(jnp.abs(sizes))
+        return jnp.where(off, mass, jnp.nan)
+
+    def constraint(self, t: Any, q: Float[Array, " n"]) -> Float[Array, " m"]:
+        """g(t, q)."""
+        if self.system.constraint is None:
+            return jnp.zeros(0, q.dtype)
+        return jnp.ravel(self.system.constraint(t, self.layout.unflatten(q), self.args)).astype(q.dtype)
+
+    def velocity_constraint(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " mp"]:
+        """(ġ, h) = (G v + g_t, h(t, q, v))."""
+        _, velocity = self._along(self.constraint, self.depends_on_time[0], t, (q,), (v,))
+        if self.system.nonholonomic is None:
+            return velocity
+        return jnp.concatenate([velocity, self._nonholonomic(t, q, v)])
+
+    def _nonholonomic(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " p"]:
+        assert self.system.nonholonomic is not None
+        flat = self.layout.unflatten
+        return jnp.ravel(self.system.nonholonomic(t, flat(q), flat(v), self.args)).astype(q.dtype)
+
+    @staticmethod
+    def _along(function: Callable[..., Any], uses_time: bool, t: Any, at: Any, direction: Any) -> Any:
+        """`function(t, *at)` and its derivative along (1, *direction); along (0, *direction) if it does not use time."""
+        if uses_time:
+            t = jnp.asarray(t, at[0].dtype)
+            return jax.jvp(function, (t, *at), (jnp.ones_like(t), *direction))
+        return jax.jvp(functools.partial(function, t), at, direction)
+
+    def constraint_jacobian(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, "mp n"]:
+        """A = [G; ∂h/∂v]."""
+        rows = []
+        if self.holonomic:
+            rows.append(jax.jacfwd(self.constraint, 1)(t, q))
+        if self.nonholonomic:
+            rows.append(jax.jacfwd(self._nonholonomic, 2)(t, q, v))
+        return jnp.concatenate(rows) if len(rows) > 1 else rows[0]
+
+    def bias(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " mp"]:
+        """γ, the second derivative of g and the first of h where v̇ = 0."""
+        uses_time = self.depends_on_time[0] or self.depends_on_time[1]
+        _, bias = self._along(lambda t, q: self.velocity_constraint(t, q, v), uses_time, t, (q,), (v,))
+        return bias
+
+    # The underlying ODE
+
+    @at_one_instant
+    def field(self, t: Any, y: Any, feedback: Any = None) -> Any:
+        q, v = y
+        return v, self._accelerations(t, q, v, feedback)[0]
+
+    @at_one_instant
+    def multipliers(self, t: Any, y: Any) -> Float[Array, " mp"]:
+        """(λ, μ), of least norm where constraints are redundant."""
+        return self._accelerations(t, *y, None)[1]
+
+    def _accelerations(self, t: Any, q: Any, v: Any, feedback: Any) -> tuple[Float[Array, " n"], Float[Array, " mp"]]:
+        normals = self.normals(t, (q, v))
+        free = mass_solve(self.mass(q), self.force(t, q, v))
+        target = self.bias(t, q, v)
+        if feedback is not None:
+            target = target + self._feedback(t, q, v, feedback)
+        target = self.linear.along(self, normals, free) + target
+        multipliers = self.linear.gram_solve(self, normals, target)
+        pulled = self.linear.lift(self, normals, multipliers)
+        if self.rank is not None:
+            pulled = self._unless_contradictory(t, (q, v), normals, target, pulled)
+        return free - pulled, multipliers
+
+    def _unless_contradictory(self, t: Any, y: Any, normals: Any, target: Any, pulled: Any) -> Any:
+        """x = M⁻¹Aᵀλ, or NaN where it leaves more of A x = b than y is off the constraints: dependent ones disagree."""
+        lengths = self.linear.lengths(normals)
+        lengths = jnp.where(lengths > 0, lengths, 1)
+        off = jnp.max(jnp.abs(self.linear.along(self, normals, pulled) - target) / lengths)
+        drift = jnp.max(jnp.concatenate(self.distances(t, y)))
+        allowed = (allowed_contradiction(drift.dtype) + 10 * drift) * (1 + jnp.max(jnp.abs(target) / lengths))
+        return jnp.where(off <= allowed, pulled, jnp.nan)
+
+    def _feedback(self, t: Any, q: Any, v: Any, feedback: Any) -> Float[Array, " mp"]:
+        velocity = self.velocity_constraint(t, q, v)
+        terms = []
+        if self.holonomic:
+            terms.append(feedback(self.constraint(t, q), velocity[: self.holonomic]))
+        if self.nonholonomic:
+            terms.append(feedback(velocity[self.holonomic :]))
+        return jnp.concatenate(terms) if len(terms) > 1 else terms[0]
+
+    # The manifold
+
+    @at_one_instant
+    def distances(self, t: Any, y: Any) -> tuple[Float[Array, " m"], Float[Array, " mp"]]:
+        """The invariants divided by the length of each constraint's gradient: about how far y is from satisfying them."""
+        lengths = self.linear.lengths(self.normals(t, y))
+        lengths = jnp.where(lengths > 0, lengths, 1)
+        g, velocity = self.invariants(t, y)
+        return jnp.abs(g) / lengths[: self.holonomic], jnp.abs(velocity) / lengths
+
+    @at_one_instant
+    def invariants(self, t: Any, y: Any) -> tuple[Float[Array, " m"], Float[Array, " mp"]]:
+        q, v = y
+        return self.constraint(t, q), self.velocity_constraint(t, q, v)
+
+    @at_one_instant
+    def normals(self, t: Any, y: Any) -> Any:
+        """The constraints' linearisation, as `normals.DenseNormals` and `normals.SparseNormals` have it."""
+        return self.linear.at(self, t, *y)
+
+    @at_one_instant
+    def tangent(self, dy: Any, normals: Any) -> Any:
+        dq, dv = dy
+        return self._tangent(normals, dq, self.holonomic), self._tangent(normals, dv, None)
+
+    def _tangent(self, normals: Any, x: Float[Array, " n"], rows: int | None) -> Float[Array, " n"]:
+        off = self.linear.along(self, normals, x)[:rows]
+        return x - self.linear.lift(self, normals, self.linear.gram_solve(self, normals, off)) if off.size else x
+
+    def shift(self, y: Any, normals: Any, mu: Float[Array, " c"]) -> Any:
+        q, v = y
+        m = self.holonomic
+        return q + self.linear.lift(self, normals, mu[:m]), v + self.linear.lift(self, normals, mu[m:])
+
+    def restore(self, t: Any, y: Any, normals: Any) -> tuple[Any, Bool[Array, ""]]:
+        q, _ = y
+        zero = jnp.zeros(2 * self.holonomic + self.nonholonomic, q.dtype)
+        return self._restored(t, y, normals, self.correction(t, y, normals, zero))
+
+    def project(self, t: Any, y: Any) -> tuple[Any, Bool[Array, ""]]:
+        normals, *first = self._first_correction(t, y)
+        return self._restored(t, y, normals, first)
+
+    @at_one_instant
+    def _first_correction(self, t: Any, y: Any) -> tuple[Any, Float[Array, " c"], Float[Array, ""]]:
+        normals = self.normals(t, y)
+        zero = jnp.zeros(2 * self.holonomic + self.nonholonomic, y[0].dtype)
+        return normals, *self.correction(t, y, normals, zero)
+
+    def _restored(self, t: Any, y: Any, normals: Any, first: Any) -> tuple[Any, Bool[Array, ""]]:
+        def iterate(params: Any) -> tuple[Float[Array, " c"], Bool[Array, ""]]:
+            *point, first = params
+            return fixed_point(lambda mu: MechanicalODE.correction(*point, mu), *first)
+
+        params = (self, t, y, normals, tuple(jax.lax.stop_gradient(first)))
+        linear_solve = solve if self.rank is None else _minimum_norm
+        mu, found = implicit_root(_manifold_residual, iterate, params, linear_solve=linear_solve)
+        landed = self.shift(y, normals, mu)
+        return landed, found if self.rank is None else found & self._all_hold(t, landed)
+
+    def _all_hold(self, t: Any, y: Any) -> Bool[Array, ""]:
+        """Whether the constraints hold that depend on others: Newton's corrections ask for as many as are independent."""
+        root = jnp.finfo(y[0].dtype).eps ** 0.5
+        near = [jnp.all(d <= root * (1 + jnp.max(jnp.abs(x)))) for d, x in zip(self.distances(t, y), y, strict=True)]
+        return near[0] & near[1]
+
+    @at_one_instant
+    def correction(self, t: Any, y: Any, normals: Any, mu: Float[Array, " c"]) -> tuple[Float[Array, " c"], Any]:
+        """One Newton correction of μ in H(t, y + N μ) = 0, and its size: positions first, then the velocities at them.
+
+        The matrix is A M⁻¹Aᵀ at the current point, which differs from the Jacobian A N by the square of the angle
+        between the two normal spaces and stays symmetric.
+        """
+        q, v = self.shift(y, normals, mu)
+        here = self.normals(t, (q, v))
+        dq, delta = jnp.zeros_like(q), jnp.zeros(0, q.dtype)
+        if self.holonomic:
+            delta = self.linear.gram_solve(self, here, self.constraint(t, q))
+            dq = self.linear.lift(self, normals, delta)
+        kappa = self.linear.gram_solve(self, here, self.velocity_constraint(t, q - dq, v))
+        sizes = relative_change(dq, q), relative_change(self.linear.lift(self, normals, kappa), v)
+        return mu - jnp.concatenate([delta, kappa]), jnp.maximum(*sizes)
+
+
+def _manifold_residual(mu: Float[Array, " c"], params: Any) -> Float[Array, " c"]:
+    ode, t, y, normals, _ = params
+    return jnp.concatenate(ode.invariants(t, ode.shift(y, normals, mu)))
+
+
+def _minimum_norm(a: Float[Array, "c c"], b: Float[Array, " c"]) -> Float[Array, " c"]:
+    # The relative cut-off separates redundancy from conditioning: on the manifold the dependent rows agree to round-off.
+    # Constraints may have any scale.
+    scale = unit_diagonal(a)
+    inverse = jnp.linalg.pinv(a * scale[:, None] * scale, rtol=float(jnp.finfo(a.dtype).eps) ** 0.5)
+    return scale * matvec(inverse, scale * b)
+
+
+def _outline(function: Callable[..., Any] | None, *args: Any) -> tuple[int, bool]:
+    """How many numbers `function` returns, and whether it uses its first argument, time."""
+    if function is None:
+        return 0, False
+    time, *rest = args
+    arrays, static = eqx.partition(rest, eqx.is_array_like)
+    jaxpr, out = jax.make_jaxpr(lambda t, a: function(t, *eqx.combine(a, static)), return_shape=True)(time, arrays)
+    variable = jaxpr.jaxpr.invars[0]
+    used = any(variable is v for eqn in jaxpr.jaxpr.eqns for v in eqn.invars) or variable in jaxpr.jaxpr.outvars
+    return int(sum(np.prod(o.shape) for o in jax.tree.leaves(out))), used

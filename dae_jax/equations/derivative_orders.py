@@ -1,0 +1,277 @@
+"""How often each equation of 0 = F(t, y, ẏ) is differentiated, also where highest derivatives cancel between equations."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ..compiler import Polynomial, polynomials
+from ..structure import (
+    SigmaAnalysis,
+    StructurallySingular,
+    column_colouring,
+    dependence,
+    jacobian_pattern,
+    seed_matrix,
+    sigma_method,
+    signature,
+    variable_indices,
+)
+from .taylor import total_derivatives
+
+
+_Polynomials = list[list[dict[tuple[int, int], Polynomial]]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Combination:
+    """Equations F̄ₗ = Σ a dᵏFᵢ/dtᵏ that take the place of others; solutions stay the same. Compared by value.
+
+    `rows`: (l, terms), with terms (i, k, a); Fₗ is one of them, with k = 0 and a = 1.
+    """
+
+    rows: tuple[tuple[int, tuple[tuple[int, int, float], ...]], ...] = ()
+
+    @property
+    def degree(self) -> int:
+        """How many derivatives of F are needed for F̄."""
+        return max((k for _, terms in self.rows for _, k, _ in terms), default=0)
+
+    def terms(self, equation: int) -> tuple[tuple[int, int, float], ...]:
+        """What F̄ₗ is made of."""
+        return dict(self.rows).get(equation, ((equation, 0, 1.0),))
+
+    def of(self, levels: list[Float[Array, " n"]]) -> list[Float[Array, " n"]]:
+        """F̄, dF̄/dt, … of F, dF/dt, …: as many fewer as the degree."""
+        if not self.rows:
+            return levels
+        entry = lambda m, i: sum(a * levels[m + k][j] for j, k, a in self.terms(i))
+        count = len(levels) - self.degree
+        return [jnp.stack([entry(m, i) for i in range(len(levels[0]))]) for m in range(count)]
+
+    def names(self, equations: tuple[str, ...]) -> tuple[str, ...]:
+        """A name for each equation."""
+        written = lambda i: "".join(
+            _sign(a, n) + derivative_of(equations[j], k) for n, (j, k, a) in enumerate(self.terms(i))
+        )
+        return tuple(map(written, range(len(equations))))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Offsets:
+    """What the Σ-method finds of F̄. `by_y`, `by_rate`: the patterns of the Jacobians of F."""
+
+    by_y: Bool[np.ndarray, "n n"]
+    by_rate: Bool[np.ndarray, "n n"]
+    signature: list[dict[int, int]]
+    sigma: SigmaAnalysis
+    combination: Combination = Combination()
+
+    @functools.cached_property
+    def indices(self) -> tuple[int, ...]:
+        """The index of each variable."""
+        c, combination = self.sigma.equation_offsets, self.combination
+        often = [c[i] + max(k for _, k, _ in combination.terms(i)) for i in range(len(c))]
+        return variable_indices(self.pattern, self.sigma.transversal, often, self.sigma.variable_offsets)
+
+    @property
+    def index(self) -> int:
+        """The structural index: how often equations must be differentiated for the derivatives of all variables."""
+        return max(self.indices, default=0)
+
+    @functools.cached_property
+    def pattern(self) -> list[list[int]]:
+        """The variables of each row of the system Jacobian."""
+        return jacobian_pattern(self.signature, self.sigma.equation_offsets, self.sigma.variable_offsets)
+
+
+class Form(Protocol):
+    """What is asked of 0 = F(t, y, ẏ). `may_cancel`: whether highest derivatives may cancel between equations."""
+
+    @property
+    def size(self) -> int: ...
+    @property
+    def equations(self) -> tuple[str, ...]: ...
+    @property
+    def variables(self) -> tuple[str, ...]: ...
+    @property
+    def may_cancel(self) -> bool: ...
+    def residual(self, t: Any, y: Any, yd: Any) -> Any: ...
+
+
+def find_offsets(form: Form, dtype: Any) -> Offsets:
+    """The Σ-method, by the linear-combination method where it fails because terms cancel.
+
+    Where u with constant entries makes uᵀ ∂F̄ᵢ/∂xⱼ^(dⱼ−cᵢ) = 0, one of the equations with the smallest offset c among those
+    with uᵢ ≠ 0 is replaced by Σ uᵢ dᵏF̄ᵢ/dtᵏ, k = cᵢ − c, in which the cancelling terms are gone. Again until there is no such
+    u: the degrees of freedom become fewer each time. What cancels is read from the equations, see
+    `dae_jax.compiler.jaxprs.polynomials`.
+
+    Errors: `ValueError` for a structurally singular system, naming its equations and variables; `NotImplementedError` for a
+    primitive that structural analysis does not know.
+
+    Source: G. Tan, N. S. Nedialkov, J. D. Pryce, Conversion methods for improving structural analysis of
+    differential-algebraic equation systems, BIT 57 (2017).
+    """
+    y, time = jax.ShapeDtypeStruct((form.size,), dtype), jax.ShapeDtypeStruct((), dtype)
+    _, by_y, by_rate = dependence(form.residual, time, y, y, derivative=True)
+    rows = signature(by_y, by_rate)
+    try:
+        found = Offsets(by_y, by_rate, rows, sigma_method(rows))
+    except StructurallySingular as singular:
+        raise ValueError(_singular(form, singular)) from None
+    slopes = functools.cache(lambda degree: Slopes(form, found, degree, dtype).as_polynomials())
+    while form.may_cancel and (better := _combined(slopes, found)):
+        found = better
+    return found
+
+
+def _combined(slopes: Callable[[int], _Polynomials | None], before: Offsets) -> Offsets | None:
+    """With some of the equations replaced; `None` where nothing cancels."""
+    c, d = before.sigma.equation_offsets, before.sigma.variable_offsets
+    candidates = _may_cancel(before.pattern)
+    found = slopes(before.combination.degree) if candidates else None
+    if found is None:
+        return None
+    entries = {i: _summed(before.combination.terms(i), found) for i in candidates}
+    jacobian = [{(j, m): a for (k, j, m), a in entries[i].items() if k == d[j] - c[i]} for i in candidates]
+    replaced: dict[int, Any] = {}
+    touched: set[int] = set()
+    for vector in _left_null_vectors(jacobian):
+        support = {candidates[place]: u for place, u in vector.items()}
+        if touched.isdisjoint(support):
+            touched.update(support)
+            lowest = min(c[i] for i in support)
+            row = max(i for i in support if c[i] == lowest)
+            terms: dict[tuple[int, int], float] = {}
+            for i, u in support.items():
+                for j, k, a in before.combination.terms(i):
+                    at = (j, k + c[i] - lowest)
+                    terms[at] = terms.get(at, 0.0) + u / support[row] * a
+            replaced[row] = tuple((j, k, a) for (j, k), a in sorted(terms.items()))
+    if not replaced:
+        return None
+    combination = Combination(tuple(sorted({**dict(before.combination.rows), **replaced}.items())))
+    found = slopes(combination.degree)
+    if found is None:
+        return None
+    rows = list(before.signature)
+    for i, terms_of_row in replaced.items():
+        rows[i] = {j: k for k, j, _ in sorted(_summed(terms_of_row, found))}
+    try:
+        after = dataclasses.replace(before, signature=rows, sigma=sigma_method(rows), combination=combination)
+    except StructurallySingular:
+        # An equation that says nothing: the system Jacobian is left singular.
+        return None
+    return after if after.sigma.degrees_of_freedom < before.sigma.degrees_of_freedom else None
+
+
+class Slopes:
+    """∂F/∂y^(k), of dF/dt and so on up to a `degree`, along as few directions as tell them apart."""
+
+    def __init__(self, form: Form, found: Offsets, degree: int, dtype: Any) -> None:
+        # A derivative of an equation has no variables but those of the equation.
+        self.pattern = found.by_y | found.by_rate
+        self.colours = column_colouring(self.pattern)
+        self.form, self.degree, self.dtype = form, degree, dtype
+        self.shape = (degree + 2, form.size)
+
+    def along(self, t: Any, orders: Float[Array, "orders n"]) -> Float[Array, "directions degree+1 n"]:
+        """The directional derivatives at t and (y, ẏ, …)."""
+        levels = lambda orders: jnp.stack(total_derivatives(self.form.residual, t, list(orders), self.degree + 1))
+        directions = np.kron(np.eye(self.shape[0]), seed_matrix(self.colours).T).reshape(-1, *self.shape)
+        return jax.vmap(lambda v: jax.jvp(levels, (orders,), (v,))[1])(jnp.asarray(directions, self.dtype))
+
+    def by_entry(self, found: np.ndarray, k: int, i: int) -> dict[tuple[int, int], Any]:
+        """Of the k-th derivative of equation i, by order and variable, from what `along` gives."""
+        found = found.reshape(self.shape[0], -1, *found.shape[1:])
+        places = np.flatnonzero(self.pattern[i])
+        return {(m, int(j)): found[m, self.colours[j], k, i] for m in range(self.shape[0]) for j in places}
+
+    def as_polynomials(self) -> _Polynomials | None:
+        """For each derivative and each equation, by order and variable; `None` where they have no such form."""
+        found = polynomials(self.along, *(jax.ShapeDtypeStruct(shape, self.dtype) for shape in ((), self.shape)))
+        if found is None:
+            return None
+        return [[self.by_entry(found, k, i) for i in range(self.form.size)] for k in range(self.degree + 1)]
+
+
+def _summed(terms: Sequence[tuple[int, int, float]], slopes: _Polynomials) -> dict[tuple[int, int, Any], float]:
+    """The slopes of a combination: coefficients that are not 0, by order, variable and monomial."""
+    value: dict[tuple[int, int, Any], float] = {}
+    size: dict[tuple[int, int, Any], float] = {}
+    for i, k, factor in terms:
+        for (order, j), entry in slopes[k][i].items():
+            for monomial, a in entry.items():
+                at = (order, j, monomial)
+                value[at] = value.get(at, 0.0) + factor * a
+                size[at] = size.get(at, 0.0) + abs(factor * a)
+    # What is left of numbers that cancel is none.
+    return {at: a for at, a in value.items() if abs(a) > 1e-12 * size[at]}
+
+
+def _may_cancel(pattern: list[list[int]]) -> list[int]:
+    """The equations that are not alone in any of their columns, those left out that are."""
+    left = set(range(len(pattern)))
+    while True:
+        count: dict[int, int] = {}
+        for i in left:
+            for j in pattern[i]:
+                count[j] = count.get(j, 0) + 1
+        alone = {i for i in left if any(count[j] == 1 for j in pattern[i])}
+        if not alone:
+            return sorted(left)
+        left -= alone
+
+
+def _left_null_vectors(rows: list[Any]) -> list[dict[int, float]]:
+    """The combinations of rows, given as polynomials over their columns, that vanish; by elimination."""
+    place: dict[Any, int] = {}
+    for row in rows:
+        for at in row:
+            place.setdefault(at, len(place))
+    basis: list[tuple[int, np.ndarray, np.ndarray]] = []
+    found = []
+    for i, row in enumerate(rows):
+        values, combined = np.zeros(len(place)), np.eye(len(rows))[i]
+        for at, a in row.items():
+            values[place[at]] = a
+        size = np.abs(values)
+        for pivot, other, how in basis:
+            factor = values[pivot] / other[pivot]
+            size = size + np.abs(factor * other)
+            values, combined = values - factor * other, combined - factor * how
+            values[pivot] = 0
+        values = np.where(np.abs(values) <= 1e-12 * size, 0, values)
+        if values.any():
+            basis.append((int(np.argmax(np.abs(values))), values, combined))
+        else:
+            used = np.abs(combined) > 1e-12 * np.abs(combined).max()
+            found.append({int(k): float(combined[k]) for k in np.flatnonzero(used)})
+    return found
+
+
+def derivative_of(equation: str, times: int) -> str:
+    """Its name."""
+    return (("", "d/dt ")[times] if times < 2 else f"d^{times}/dt^{times} ") + equation
+
+
+def _sign(factor: float, place: int) -> str:
+    sign = (" + ", " − ") if place else ("", "−")
+    return sign[factor < 0] + ("" if abs(factor) == 1 else f"{abs(factor):.4g}·")
+
+
+def _singular(form: Form, singular: StructurallySingular) -> str:
+    parts = []
+    if singular.equations:
+        names = ", ".join(form.equations[i] for i in singular.equations)
+        parts.append(f"the equations {names} have too few variables between them")
+    if singular.variables:
+        names = ", ".join(form.variables[j] for j in singular.variables)
+        parts.append(f"the variables {names} have too few equations between them")
+    return f"The system is structurally singular: {'; '.join(parts)}."

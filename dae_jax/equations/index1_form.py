@@ -1,0 +1,98 @@
+"""The index-1 equations that differentiation and a selection of states make of any system, for solvers of residuals."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ..linalg import take
+from ..structure import dependence
+from .constraints import at_one_instant
+from .structural_ode import StructuralODE
+
+
+class ReducedForm(eqx.Module):
+    """0 = F(t, z, ż) of index 1 for z = (Y, X), the state of a `StructuralODE` and the derivatives of order Dⱼ:
+
+        0 = Fᵢ^(Cᵢ)(t, Y, X)                                for every equation,
+        0 = Ẏₑ − (its derivative in (Y, X))                for the entries of Y that are integrated,
+        0 = Hₖ(t, Y)                                        for the others, the dummy derivatives.
+
+    `directions`: a unit row for each invariant, at the entry of Y that is its dummy derivative. It stands in for a
+    `ResidualForm`.
+    """
+
+    ode: StructuralODE
+    directions: Float[Array, "m N"]
+
+    @property
+    def size(self) -> int:
+        """The number of unknowns."""
+        return self.ode.orders.size + self.ode.form.size
+
+    @property
+    def equations(self) -> tuple[str, ...]:
+        """A name for each equation."""
+        return (*(f"state[{i}]" for i in range(self.ode.orders.size)), *self.ode.equations)
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """A name for each unknown."""
+        return (*(f"state[{i}]" for i in range(self.ode.orders.size)), *self.ode.form.variables)
+
+    @property
+    def shown(self) -> Bool[np.ndarray, " z"]:
+        """Which unknowns are the user's."""
+        return np.isin(np.arange(self.size), self.ode.orders.places[0][: self.ode.form.layout.size])
+
+    @property
+    def may_cancel(self) -> bool:
+        """Whether highest derivatives may cancel between equations."""
+        return False
+
+    def encode(self, t: Any, y: Float[Array, " N"]) -> Float[Array, " z"]:
+        """(Y, X)."""
+        return jnp.concatenate([y, self.ode.highest(t, y)])
+
+    def decode(self, t: Any, z: Float[Array, " z"]) -> Any:
+        """The state in the user's structure."""
+        form = self.ode.form
+        return form.decode(t, take(z, self.ode.orders.places[0][: form.layout.size]))
+
+    def known_rates(self, z: Float[Array, " z"]) -> Float[Array, " z"]:
+        """What z itself says of ż: the rate of all of Y."""
+        return jnp.concatenate([take(z, self.ode.orders.derivatives), jnp.zeros(self.ode.form.size, z.dtype)])
+
+    def with_all_candidates(self, dtype: Any) -> "ReducedForm":
+        """With every entry that may become a dummy derivative marked by a half, for structural analysis: whatever is
+        selected, its equations depend on no more.
+        """
+        orders = self.ode.orders
+        t, y, x = (jax.ShapeDtypeStruct(shape, dtype) for shape in ((), (orders.size,), (self.ode.form.size,)))
+        pattern = dependence(self.ode.of_highest_order, t, y, x, derivative=True)[2]
+        rows = []
+        for k in range(1, max(orders.equations) + 1):
+            place = orders.dummies(k)
+            for i in orders.rows(k - 1):
+                row = np.zeros(orders.size)
+                row[place[pattern[i] & (place >= 0)]] = 0.5
+                rows.append(row)
+        return ReducedForm(self.ode, jnp.asarray(np.reshape(rows, (len(rows), orders.size)), dtype))
+
+    @at_one_instant
+    def residual(self, t: Any, z: Float[Array, " z"], zd: Float[Array, " z"]) -> Float[Array, " z"]:
+        """F(t, z, ż)."""
+        orders = self.ode.orders
+        y, x = z[: orders.size], z[orders.size :]
+        highest = max(orders.equations)
+        levels = self.ode.levels(t, y, x, highest + 1)
+        last = self.ode.highest_of(levels)
+        rates = (zd - self.known_rates(z))[: orders.size]
+        if not highest:
+            return jnp.concatenate([rates, last])
+        invariants = jnp.concatenate([take(levels[k], orders.rows(k)) for k in range(highest)])
+        integrated = 1 - jnp.sum(self.directions, 0)
+        return jnp.concatenate([integrated * rates + jnp.sum(invariants[:, None] * self.directions, 0), last])

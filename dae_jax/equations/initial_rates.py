@@ -1,0 +1,72 @@
+"""ẏ at the start of 0 = F(t, y, ẏ) where F is nonlinear in it."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ..linalg import solve
+from ..structure import dependence
+from .residual_form import ResidualForm
+
+
+# Where ẏ is looked for, besides the guess: in directions at random, at these distances from it.
+DIRECTIONS, DISTANCES = 8, (0.1, 1.0, 10.0)
+STEPS = 60
+# Solutions that differ by more, relative to their size, are several.
+APART = 1e-4
+
+
+def is_nonlinear(form: Any, dtype: Any) -> bool:
+    """Whether F depends on ẏ other than linearly."""
+    if not isinstance(form, ResidualForm) or not form.may_be_nonlinear:
+        return False
+    time, y = jax.ShapeDtypeStruct((), dtype), jax.ShapeDtypeStruct((form.size,), dtype)
+    slope = lambda t, y, yd, along: jax.jvp(lambda yd: form.residual(t, y, yd), (yd,), (along,))[1]
+    try:
+        _, _, on_rates, _ = dependence(slope, time, y, y, y, derivative=True)
+    except NotImplementedError:
+        return False
+    return bool(on_rates.any())
+
+
+def rates_of(form: ResidualForm, t: Any, y: Float[Array, " n"]) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
+    """ẏ with F(t, y, ẏ) = 0, or with the least F, by the Levenberg–Marquardt method from the form's guess; where the user
+    gave none, from others also, and whether these led to different solutions.
+
+    Source: J. Nocedal, S. J. Wright, *Numerical Optimization*, 2nd ed., section 10.3.
+    """
+    guess = form.known_rates(y)
+    if form.rates_are_given:
+        return _nearest(form, t, y, guess)[0], jnp.asarray(False)
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(DIRECTIONS, form.size)) / np.sqrt(form.size)
+    offsets = np.concatenate([np.zeros((1, form.size)), *(size * directions for size in DISTANCES)])
+    found, left = jax.vmap(lambda offset: _nearest(form, t, y, guess + offset))(jnp.asarray(offsets, y.dtype))
+    solved = left <= jnp.finfo(y.dtype).eps ** 0.75 * (1 + jnp.max(jnp.abs(found), 1)) + 2 * jnp.min(left)
+    first = jnp.argmin(jnp.where(solved, jnp.arange(len(offsets)), len(offsets)))
+    # Of variables whose derivative does not occur the guess is kept, offset and all.
+    slopes = jnp.abs(jax.jacfwd(form.residual, 2)(t, y, found[first]))
+    moved = jnp.max(jnp.abs(found - found[first]) * (jnp.max(slopes, 0) > 0), 1)
+    several = jnp.any(solved & (moved > APART * (1 + jnp.max(jnp.abs(found[first])))))
+    return jnp.where(jnp.max(slopes, 0) > 0, found[first], guess), several
+
+
+def _nearest(form: ResidualForm, t: Any, y: Any, start: Any) -> tuple[Float[Array, " n"], Float[Array, ""]]:
+    """Where F is least near a start, and its size there."""
+    eye = jnp.eye(form.size, dtype=y.dtype)
+    size = lambda r: jnp.sum(r * r)
+
+    def improve(_: Any, carry: Any) -> Any:
+        yd, damping = carry
+        r, slopes = form.residual(t, y, yd), jax.jacfwd(form.residual, 2)(t, y, yd)
+        normal = jnp.sum(slopes[:, :, None] * slopes[:, None, :], 0)
+        least = jnp.finfo(y.dtype).eps * (1 + jnp.trace(normal))
+        step = solve(normal + (damping * jnp.trace(normal) + least) * eye, jnp.sum(slopes * r[:, None], 0))
+        better = size(form.residual(t, y, yd - step)) < size(r)
+        return jnp.where(better, yd - step, yd), jnp.where(better, damping / 10, jnp.minimum(10 * damping, 1e6))
+
+    yd, _ = jax.lax.fori_loop(0, STEPS, improve, (start, jnp.asarray(1e-3, y.dtype)))
+    return yd, jnp.sqrt(size(form.residual(t, y, yd)))

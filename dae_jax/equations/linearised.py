@@ -1,0 +1,264 @@
+"""The linearisation of 0 = F(t, y, ẏ): what a solver of residuals needs to solve for a step."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Inexact, Int
+
+from ..linalg.dense import LOOPED
+from ..linalg.storage import Banded, Dense, Storage
+from ..structure import (
+    bandwidth,
+    column_colouring,
+    highest_value_transversal,
+    reverse_cuthill_mckee,
+    seed_matrix,
+    sigma_method,
+    signature,
+)
+from ..systems import ConstrainedSystem
+from .constraints import at_one_instant
+from .derivative_orders import Combination, Offsets, find_offsets
+from .index1_form import ReducedForm
+from .initial_rates import is_nonlinear, rates_of
+from .residual_form import ResidualForm
+
+
+GAUSS_NEWTON = 5
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Compression:
+    """A Jacobian as the directional derivatives along `seeds`, and where its stored entries are among them (−1: 0)."""
+
+    seeds: Float[np.ndarray, "colours n"]
+    places: Int[np.ndarray, "n width"]
+
+    def entries(self, compressed: Float[Array, "colours n"]) -> Float[Array, "n width"]:
+        """The stored entries."""
+        return jnp.where(self.places >= 0, compressed.reshape(-1)[self.places], 0)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Outline:
+    """What is known of a residual's linearisation before it is evaluated. Compared by identity: keep one for a pattern.
+
+    `indices`, `offsets`: the index of each variable, and how often it is differentiated (d of the Σ-method);
+    `differential`: whether its derivative occurs; `hidden`: whether an equation must be differentiated to see which values
+    are consistent; `combination`: of the rows, before these are factored; `by_y`, `by_rate`: the compressed Jacobians,
+    `None` for small ones.
+    """
+
+    storage: Storage
+    indices: tuple[int, ...]
+    offsets: tuple[int, ...]
+    differential: Bool[np.ndarray, " n"]
+    hidden: bool
+    combination: Combination
+    by_y: Compression | None
+    by_rate: Compression | None
+
+
+class Pencil(eqx.Module):
+    """J + c M with J = ∂F/∂y and M = ∂F/∂ẏ, of a residual. It travels through `diffrax.diffeqsolve` as `args`.
+
+    `start`: ẏ where a solve starts.
+    """
+
+    form: ResidualForm | ReducedForm
+    outline: Outline = eqx.field(static=True)
+    start: Float[Array, " n"] | None = None
+
+    @classmethod
+    def of(
+        cls, form: ResidualForm | ReducedForm, y: Float[Array, " n"], indices: tuple[int, ...] | None = None
+    ) -> "Pencil":
+        """Finds, while tracing, which equation depends on which variable and derivative.
+
+        Errors: `ValueError` for a structurally singular system.
+        """
+        try:
+            found = find_offsets(form, y.dtype)
+        except NotImplementedError:
+            # A primitive that structural analysis does not know: all may depend on all.
+            full = np.ones((y.size, y.size), bool)
+            rows = signature(full, full)
+            found = Offsets(full, full, rows, sigma_method(rows))
+        patterns = found.by_y.tobytes(), found.by_rate.tobytes()
+        indices = indices or found.indices
+        offsets = found.sigma.variable_offsets
+        return cls(form, _outline(*patterns, indices, offsets, found.index > 1, found.combination))
+
+    @property
+    def storage(self) -> Storage:
+        """How J and M are stored."""
+        return self.outline.storage
+
+    def decode(self, t: Any, y: Float[Array, " n"]) -> Any:
+        """The state in the user's structure."""
+        return self.form.decode(t, y)
+
+    def residual(self, t: Any, y: Float[Array, " n"], yd: Float[Array, " n"]) -> Float[Array, " n"]:
+        """F(t, y, ẏ)."""
+        return self.form.residual(t, y, yd)
+
+    def jacobians(self, t: Any, y: Float[Array, " n"], yd: Float[Array, " n"]) -> tuple[Array, Array]:
+        """J and M."""
+        t = jnp.asarray(t, y.dtype)
+        return self._by_y(t, y, yd), self._by_rate(t, y, yd)
+
+    @at_one_instant
+    def _by_y(self, t: Any, y: Float[Array, " n"], yd: Float[Array, " n"]) -> Array:
+        return self._by(1, self.outline.by_y, t, y, yd)
+
+    @at_one_instant
+    def _by_rate(self, t: Any, y: Float[Array, " n"], yd: Float[Array, " n"]) -> Array:
+        return self._by(2, self.outline.by_rate, t, y, yd)
+
+    def _by(self, argument: int, compression: Compression | None, *point: Any) -> Array:
+        """The stored entries of the derivative of F(t, y, ẏ) by one of its arguments."""
+        if compression is None:
+            return jax.jacfwd(self.form.residual, argument)(*point)
+        of = lambda x: self.residual(*point[:argument], x, *point[argument + 1 :])
+        along = lambda seed: jax.jvp(of, (point[argument],), (seed,))[1]
+        return compression.entries(jax.vmap(along)(jnp.asarray(compression.seeds, point[1].dtype)))
+
+    def factor(self, j: Array, m: Array, c: Any, h: Any) -> tuple[Any, Float[Array, ""]]:
+        """The factors of J + c M, for c of the order of 1/h, and the smallest pivot, of round-off size for a singular one.
+
+        With column j scaled by h^dⱼ, the rows tend with h → 0 to those of the Σ-method's system Jacobian, however high the
+        index, or of the combination's; without, the condition would grow like h^(−index).
+        """
+        scale = self.column_scale(h)
+        matrix = self.storage.scale_columns(self._combined(j + c * m, c), scale)
+        factors, smallest = self.storage.factor(matrix)
+        return (factors, scale, c), smallest
+
+    def column_scale(self, h: Any) -> Float[Array, " n"]:
+        """h^dⱼ."""
+        return powers(jnp.minimum(jnp.abs(h), 1), self.outline.offsets)
+
+    def solve(self, factors: Any, b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
+        """x with (J + c M) x = b."""
+        inner, scale, c = factors
+        return scale * self.storage.solve(inner, self._combined(b, c))
+
+    def _combined(self, rows: Any, c: Any) -> Any:
+        """Rows, or right-hand sides, in the combination in which highest derivatives do not cancel, with c for d/dt."""
+        combination = self.outline.combination
+        return combination.of([rows * c**k if k else rows for k in range(combination.degree + 1)])[0]
+
+    def rates(self, t: Any, y: Float[Array, " n"]) -> Float[Array, " n"]:
+        """ẏ with F(t, y, ẏ) = 0 where y is consistent, else with the least F; for variables whose derivative does not occur
+        what the form knows. Gauss–Newton's method, or a search where F is nonlinear in ẏ.
+        """
+        t = jnp.asarray(t, y.dtype)
+        if is_nonlinear(self.form, y.dtype):
+            return rates_of(self.form, t, y)[0]
+
+        def improve(_: Any, yd: Any) -> Any:
+            return yd - self.storage.least_squares(self._by_rate(t, y, yd), self.residual(t, y, yd))
+
+        return jax.lax.fori_loop(0, GAUSS_NEWTON, improve, self.form.known_rates(y))
+
+    def starting(self, t: Any, y: Float[Array, " n"]) -> "Pencil":
+        """For a solve from (t, y)."""
+        return dataclasses.replace(self, start=jax.lax.stop_gradient(self.rates(t, y)))
+
+    def weights(self, h: Any, raised: Any = 1.0) -> Float[Array, " n"]:
+        """h^(k−1) for a variable of index k > 1: how much of its error counts; up to `raised` times that, or h^(k−2), for those
+        that the user sees.
+
+        Source: E. Hairer, G. Wanner, *Solving Ordinary Differential Equations II*, VII.3 and the program RADAU5.
+        """
+        size = jnp.minimum(jnp.abs(h), 1)
+        indices = np.array(self.outline.indices)
+        weights = powers(size, tuple(np.maximum(indices - 1, 0).tolist()))
+        seen = self._followed
+        return weights * jnp.where(seen, jnp.clip(raised, 1, 1 / size), 1) if seen.any() else weights
+
+    def between(self, dense: bool) -> Bool[np.ndarray, " n"]:
+        """Of which variables the way between the ends of a step counts: the user's of index 2 and higher, which follow from
+        derivatives; with `dense` all of the user's.
+        """
+        return self.form.shown & (dense | self._followed)
+
+    @property
+    def _followed(self) -> Bool[np.ndarray, " n"]:
+        """Which of the user's variables are of index 2 and higher, those of a mechanism apart: its velocities follow from
+        positions that are controlled.
+        """
+        mechanism = isinstance(self.form, ResidualForm) and isinstance(self.form.system, ConstrainedSystem)
+        return self.form.shown & (np.array(self.outline.indices) > 1) & (not mechanism)
+
+    def counted(self, dense: bool) -> Bool[np.ndarray, " n"]:
+        """Which variables are of index 0 or 1, or seen by the user where values between steps are wanted."""
+        return (np.array(self.outline.indices) <= 1) | (dense & self.form.shown)
+
+
+def powers(x: Float[Array, ""], exponents: tuple[int, ...]) -> Float[Array, " n"]:
+    """x to each of the exponents."""
+    values = [jnp.ones_like(x)]
+    for _ in range(max(exponents, default=0)):
+        values.append(values[-1] * x)
+    return (
+        jnp.stack([values[k] for k in exponents])
+        if len(exponents) <= LOOPED
+        else jnp.stack(values)[np.array(exponents)]
+    )
+
+
+@functools.lru_cache(maxsize=64)
+def _outline(
+    on_y: bytes,
+    on_rate: bytes,
+    indices: tuple[int, ...],
+    offsets: tuple[int, ...],
+    hidden: bool,
+    combination: Combination,
+) -> Outline:
+    n = len(indices)
+    by_y, by_rate = (np.frombuffer(x, bool).reshape(n, n) for x in (on_y, on_rate))
+    storage = _storage(by_y | by_rate, highest_value_transversal(signature(by_y, by_rate)))
+    small = n <= LOOPED
+    return Outline(
+        storage,
+        indices,
+        offsets,
+        by_rate.any(0),
+        hidden,
+        combination if isinstance(storage, Dense) else Combination(),
+        None if small else _compression(by_y, storage),
+        None if small else _compression(by_rate, storage),
+    )
+
+
+def _storage(pattern: Bool[np.ndarray, "n n"], transversal: list[int]) -> Storage:
+    """A band, with each equation in the place of its variable, where that is cheaper."""
+    n = len(pattern)
+    if n <= LOOPED:
+        return Dense(n)
+    equation_of = np.argsort(transversal)
+    paired = pattern[equation_of]
+    order = reverse_cuthill_mckee(paired | paired.T)
+    ordered = paired[np.ix_(order, order)]
+    lower, upper = bandwidth(np.tril(ordered)), bandwidth(np.triu(ordered))
+    if 4 * (lower + 1) * (lower + upper + 1) > n * n:
+        return Dense(n)
+    return Banded(equation_of[order], order, lower, upper)
+
+
+def _compression(pattern: Bool[np.ndarray, "n n"], storage: Storage) -> Compression:
+    n = len(pattern)
+    colours = column_colouring(pattern)
+    if isinstance(storage, Banded):
+        rows, columns = storage.positions()
+    else:
+        rows, columns = np.indices((n, n))
+    used = (columns >= 0) & pattern[rows, columns]
+    return Compression(seed_matrix(colours).T, np.where(used, colours[columns] * n + rows, -1))

@@ -1,0 +1,244 @@
+"""What must hold of a mechanism where a solve starts and where it ends: its masses, its constraints' rank, and no drift."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ..linalg import smallest_pivot
+from .constraint_jacobian import Rank, SparseNormals, matvec
+from .constraints import MechanicalODE, allowed_contradiction
+
+
+# A drift that counts as large as the solution itself, as a part of this: the distance to |q| = 1 is nowhere more than |q|/2.
+LARGE = 0.25
+# What a step may leave of the constraints that its method keeps, in parts of the tolerance.
+LEFT = 100
+# Tolerances that stand in for those of fixed steps.
+COARSE = 1e-3
+
+
+def mass_is_regular(ode: MechanicalODE, q: Float[Array, " n"], invertible: bool) -> Bool[Array, ""]:
+    """Whether M(q) is symmetric and positive definite; semidefinite is enough where it need not be `invertible`."""
+    mass = ode.unchecked_mass(q)
+    if mass is None:
+        return jnp.asarray(True)
+    if mass.ndim < 2:
+        return jnp.all(mass > 0) if invertible else jnp.all(mass >= 0)
+    diagonal = jnp.diagonal(mass)
+    scale = 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
+    roundoff = jnp.finfo(q.dtype).eps ** 0.75
+    least = 8 * len(mass) * jnp.finfo(q.dtype).eps if invertible else -roundoff
+    scaled = mass * scale[:, None] * scale + (0 if invertible else 2 * roundoff) * jnp.eye(len(mass), dtype=mass.dtype)
+    symmetric = jnp.max(jnp.abs(mass - mass.T)) <= roundoff * jnp.max(jnp.abs(mass))
+    return symmetric & jnp.all(diagonal >= 0) & (smallest_pivot(scaled) > least)
+
+
+def mass_message(mass: Float[np.ndarray, "..."], invertible: bool) -> str:
+    """What is wrong with a mass matrix that is not regular."""
+    least = "symmetric and positive definite" if invertible else "symmetric and positive semidefinite"
+    advice = ""
+    if mass.ndim < 2:
+        (at,) = np.nonzero(~((mass > 0) if invertible else (mass >= 0))) if mass.ndim else ([0],)
+        what = f"mass[{at[0]}] is {np.atleast_1d(mass)[at[0]]:.6g}"
+        massless = invertible and np.all(mass >= 0)
+    elif np.max(np.abs(mass - mass.T)) > np.finfo(mass.dtype).eps ** 0.75 * np.max(np.abs(mass)):
+        i, j = np.unravel_index(np.argmax(np.abs(mass - mass.T)), mass.shape)
+        what = f"it is not symmetric: mass[{i}, {j}] is {mass[i, j]:.6g}, mass[{j}, {i}] is {mass[j, i]:.6g}"
+        massless = False
+    else:
+        smallest = np.linalg.eigvalsh(mass)[0]
+        what = f"its smallest eigenvalue is {smallest:.6g}"
+        massless = invertible and smallest > -(np.finfo(mass.dtype).eps ** 0.75) * np.max(np.abs(mass))
+    if massless:
+        advice = (
+            " A massless coordinate that the constraints determine is for methods that do without M⁻¹: RadauIIA5() or BDF() "
+            "with GGL() or Residual(...), DummyDerivatives(), or StateSpace(...)."
+        )
+    return f"The mass matrix must be {least} at the start, but {what}.{advice}"
+
+
+class Redundancy(eqx.Module):
+    """How the constraints depend on each other at a state.
+
+    `holonomic`, `all`: how many are independent of the holonomic ones and of all; `weak`: the least eigenvalue of A Aᵀ for
+    rows of length 1; `contradiction`: the part of the accelerations' right-hand side that no multipliers can satisfy,
+    relative to its size; `agree`: whether at a state nearby that satisfies as many constraints the others hold too, which
+    are therefore redundant and not only dependent here; `zero`: whose gradient vanishes.
+    """
+
+    holonomic: Any
+    all: Any
+    weak: Float[Array, ""]
+    contradiction: Float[Array, ""]
+    agree: Bool[Array, ""]
+    zero: Bool[Array, " mp"]
+
+
+def redundancy(ode: MechanicalODE, t: Any, y: Any) -> Redundancy:
+    """Whether constraints depend on each other at the flat state y = (q, v)."""
+    m = ode.holonomic
+    a, scale = _unit_rows(ode, t, y)
+    values, vectors = jnp.linalg.eigh(a @ a.T)
+    cut = jnp.finfo(a.dtype).eps ** 0.5
+    independent = values > cut * values[-1]
+    holonomic = jnp.sum((h := jnp.linalg.eigvalsh(a[:m] @ a[:m].T)) > cut * h[-1]) if m else 0
+    target = ode.bias(t, *y) * scale
+    contradiction = jnp.max(jnp.abs(jnp.where(independent, 0, vectors.T @ target))) / (1 + jnp.max(jnp.abs(target)))
+    agree = _agree_nearby(ode, t, y, holonomic, jnp.sum(independent))
+    return Redundancy(holonomic, jnp.sum(independent), values[0], contradiction, agree, jnp.all(a == 0, 1))
+
+
+def weakest(ode: MechanicalODE, t: Any, y: Any) -> Float[Array, ""]:
+    """The smallest pivot of A Aᵀ for rows of length 1: of round-off size where constraints depend on each other."""
+    if isinstance(ode.linear, SparseNormals):
+        ones = jnp.ones(ode.holonomic, y[0].dtype)
+        regular = jnp.all(jnp.isfinite(ode.linear.gram_solve(ode, ode.normals(t, y), ones)))
+        return jnp.where(regular, 1.0, 0.0).astype(y[0].dtype)
+    a, _ = _unit_rows(ode, t, y)
+    return smallest_pivot(jnp.sum(a[:, None] * a, -1))
+
+
+def _unit_rows(ode: MechanicalODE, t: Any, y: Any) -> tuple[Float[Array, "mp n"], Float[Array, " mp"]]:
+    """A with rows of length 1, and what they were multiplied by; rows of zeros as they are."""
+    a = ode.constraint_jacobian(t, *y)
+    lengths = jnp.sqrt(jnp.sum(a * a, 1))
+    scale = 1 / jnp.where(lengths > 0, lengths, 1)
+    return a * scale[:, None], scale
+
+
+def _agree_nearby(ode: MechanicalODE, t: Any, y: Any, holonomic: Any, rank: Any) -> Bool[Array, ""]:
+    """Whether all constraints hold where the state has moved along the manifold of as many of them."""
+    m, (q, v) = ode.holonomic, y
+    eps = jnp.finfo(q.dtype).eps
+    step = eps**0.25
+    rng = np.random.default_rng(0)
+    away = lambda x: step * (1 + jnp.max(jnp.abs(x))) * jnp.asarray(rng.uniform(-1, 1, x.shape), x.dtype)
+
+    def nearest(a: Any, off: Any, rank: Any) -> Any:
+        """The shortest x with A x = off in `rank` directions."""
+        values, vectors = jnp.linalg.eigh(a @ a.T)
+        kept = jnp.arange(len(values)) >= len(values) - rank
+        return a.T @ (vectors @ jnp.where(kept, vectors.T @ off / jnp.where(kept, values, 1), 0))
+
+    def corrected(_: Any, y: Any) -> Any:
+        q, v = y
+        a, scale = _unit_rows(ode, t, (q, v))
+        if m:
+            q = q - nearest(a[:m], ode.constraint(t, q) * scale[:m], holonomic)
+        return q, v - nearest(a, ode.velocity_constraint(t, q, v) * scale, rank)
+
+    a, _ = _unit_rows(ode, t, y)
+    tangent = lambda a, x, rank: x - nearest(a, a @ x, rank)
+    moved = q + tangent(a[:m], away(q), holonomic) if m else q + away(q), v + tangent(a, away(v), rank)
+    nearby = jax.lax.fori_loop(0, 8, corrected, moved)
+    agrees = [
+        jnp.all(there <= 4 * jnp.max(here, initial=0) + eps**0.75 * (1 + jnp.max(jnp.abs(x))))
+        for here, there, x in zip(ode.distances(t, y), ode.distances(t, nearby), (q, v), strict=True)
+    ]
+    return agrees[0] & agrees[1]
+
+
+def rank_message(ode: MechanicalODE, found: Redundancy, given: int | Rank | None) -> str | None:
+    """What is wrong with the constraints' rank at the start; `None` where they are independent or redundant."""
+    count = ode.holonomic + ode.nonholonomic
+    rank = int(found.all)
+    here = (int(found.holonomic), rank) if isinstance(given, tuple) else rank
+    if given is not None and given != here:
+        return (
+            f"`rank` says that {given} of the {count} constraints are independent, but the constraints have rank {here} of "
+            f"{count} at the start. Leave `rank` out to have it found, or correct it."
+        )
+    if rank == count:
+        return None
+    stands = f"rank {rank} of {count} at the start"
+    if not bool(found.agree):
+        names = [f"constraint[{i}]" for i in range(ode.holonomic)]
+        names += [f"nonholonomic[{i}]" for i in range(ode.nonholonomic)]
+        zero = [name for name, vanishes in zip(names, np.asarray(found.zero), strict=True) if vanishes]
+        if zero:
+            return (
+                f"The constraints have {stands}: the gradient of {', '.join(zero)} vanishes there, so that no force "
+                "belongs to it. Write the constraint itself, not its square or a multiple that is zero there, or start "
+                "from another state."
+            )
+        if float(found.weak) > jnp.finfo(found.weak.dtype).eps ** 0.75:
+            return None
+        return (
+            f"The constraints have {stands}, and more beside it: a singular configuration, as a dead centre or a stretched "
+            "linkage is one, from which motion is not determined. Start from another state."
+        )
+    if float(found.contradiction) > allowed_contradiction(found.contradiction.dtype):
+        return (
+            f"Only {rank} of the {count} constraints are independent at the start, and the others contradict them: no "
+            "acceleration satisfies all. Remove the redundant constraints or make them agree."
+        )
+    return None
+
+
+def rank_of(ode: MechanicalODE, found: Redundancy) -> Rank | None:
+    """The rank to solve with, where `rank_message` finds no fault; `None`: all are independent."""
+    redundant = int(found.all) < ode.holonomic + ode.nonholonomic and bool(found.agree)
+    return (int(found.holonomic), int(found.all)) if redundant else None
+
+
+def has_rank(ode: MechanicalODE, t: Any, y: Any, rank: Rank | None) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+    """Whether the constraints have the given rank (`None`: all are independent): to working accuracy, and beyond doubt."""
+    if rank is None:
+        least, eps = weakest(ode, t, y), jnp.finfo(y[0].dtype).eps
+        return least > eps**0.75, least > eps**0.5
+    found = redundancy(ode, t, y)
+    consistent = found.contradiction <= allowed_contradiction(y[0].dtype)
+    fits = (found.holonomic == rank[0]) & (found.all == rank[1]) & found.agree & consistent
+    return fits, fits
+
+
+def is_near_constraints(
+    ode: MechanicalODE,
+    t: Any,
+    start: Any,
+    end: Any,
+    keeps: tuple[bool, bool],
+    tolerances: tuple[Any, Any],
+    residual: bool,
+) -> Bool[Array, ""]:
+    """Whether a flat state at the end of a solve satisfies g and (ġ, h).
+
+    A level that the method `keeps` must hold to round-off, or to the tolerances (relative, absolute) where it solves for a
+    `residual`. One that it lets drift may be off by a part of the solution's size; of constraints that depend on each
+    other, all as much as any.
+    """
+    rtol, atol = tolerances
+    root = jnp.finfo(end[0].dtype).eps ** 0.5
+    size = lambda x: jnp.max(jnp.abs(x), initial=0)
+    lengths = jnp.maximum(size(start[0]), size(end[0]))
+    # A pendulum at rest has a natural speed too.
+    field = jnp.zeros_like(lengths) if keeps[1] else size(ode.field(t, end)[1])
+    natural = jnp.sqrt(jnp.where(jnp.isfinite(field), field, 0) * lengths)
+    speeds = jnp.maximum(jnp.maximum(size(start[1]), size(end[1])), natural)
+    near = jnp.asarray(True)
+    for distance, kept, here in zip(ode.distances(t, end), keeps, (lengths, speeds), strict=True):
+        by_tolerance = LEFT * (atol + rtol * here) if residual or not kept else 0
+        allowed = root * (1 + here) + by_tolerance + (0 if kept else LARGE * here)
+        near = near & jnp.all(distance <= allowed)
+    return near & _redundant_agree(ode, t, end, root)
+
+
+def _redundant_agree(ode: MechanicalODE, t: Any, y: Any, root: Any) -> Bool[Array, ""]:
+    """Whether constraints that depend on others are off as these are: by what they have in common, not by a difference."""
+    if ode.rank is None:
+        return jnp.asarray(True)
+    a, scale = _unit_rows(ode, t, y)
+    agree = jnp.asarray(True)
+    for level, rank, x in zip(ode.invariants(t, y), ode.rank, y, strict=True):
+        rows = len(level)
+        if rows:
+            off = level * scale[:rows]
+            _, vectors = jnp.linalg.eigh(a[:rows] @ a[:rows].T)
+            parts = jnp.abs(matvec(vectors.T, off))
+            kept, others = jnp.max(parts[rows - rank :], initial=0), jnp.max(parts[: rows - rank], initial=0)
+            agree = agree & (others <= kept / 2 + root * (1 + jnp.max(jnp.abs(x))))
+    return agree

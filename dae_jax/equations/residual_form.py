@@ -1,0 +1,205 @@
+"""Any system as 0 = F(t, y, ẏ) on flat vectors: what structural analysis and the solvers of residuals see."""
+
+import dataclasses
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ..linalg import row_products, solve
+from ..structure.layout import Layout
+from ..systems import ConstrainedSystem, ImplicitDAE, SemiExplicitDAE, System
+from .constraints import MechanicalODE, at_one_instant
+
+
+# Up to this many unknowns multipliers are found without M⁻¹, where coordinates may be massless.
+BORDERED = 200
+Form = Literal["index-3", "index-2", "GGL"]
+
+
+class ResidualForm(eqx.Module):
+    """0 = F(t, y, ẏ). For a `ConstrainedSystem`, in the given form, y = (q, v, λ) or (q, v, λ, η) and
+
+        index-3:  0 = q̇ − v,            0 = M v̇ − f + Aᵀλ,   0 = (g, h);
+        index-2:  0 = q̇ − v,            0 = M v̇ − f + Aᵀλ,   0 = (G v + g_t, h);
+        GGL:      0 = M (q̇ − v) + Gᵀη,  0 = M v̇ − f + Aᵀλ,   0 = (G v + g_t, h),   0 = g,
+
+    for a `SemiExplicitDAE` y = (x, z) and F = (ẋ − f, g). The multipliers in y are those of the equations divided by `units`,
+    so that a multiplier has the size of the acceleration, and η of the velocity, that it brings about.
+
+    Source of GGL: C. W. Gear, B. Leimkuhler, G. K. Gupta, J. Comput. Appl. Math. 12–13 (1985), 77–90.
+    """
+
+    system: System
+    args: Any
+    form: Form = eqx.field(static=True)
+    layout: Layout = eqx.field(static=True)
+    extra: int = eqx.field(static=True)
+    equations: tuple[str, ...] = eqx.field(static=True)
+    units: Float[Array, " extra"] | None = None
+
+    @classmethod
+    def of(cls, system: System, t: Any, state: Any, args: Any, form: Form = "index-3") -> "ResidualForm":
+        """The residual of `system`; `state` gives shapes only."""
+        layout = Layout.of(state)
+        if isinstance(system, ConstrainedSystem):
+            ode = MechanicalODE.of(system, t, state, args)
+            names = ode.layout.names()
+            rows = [f"constraint[{i}]" for i in range(ode.holonomic)]
+            rolls = [f"nonholonomic[{i}]" for i in range(ode.nonholonomic)]
+            dots = [f"d/dt {row}" for row in rows]
+            levels = rows if form == "index-3" else dots
+            equations = [f"dq/dt − v{n}" for n in names] + [f"force{n}" for n in names] + levels + rolls
+            equations += rows if form == "GGL" else []
+            extra = ode.holonomic * (2 if form == "GGL" else 1) + ode.nonholonomic
+            return cls(system, args, form, layout, extra, tuple(equations))
+        if isinstance(system, SemiExplicitDAE):
+            x, z = state
+            out = jax.eval_shape(lambda: system.g(t, x, z, args))
+            equations = tuple(f"dx/dt − f{n}" for n in Layout.of(x).names()) + _names("g", out)
+        else:
+            out = jax.eval_shape(lambda: system.residual(t, state, state, args))
+            equations = _names("residual", out)
+        if len(equations) != layout.size:
+            raise ValueError(
+                f"{type(system).__name__} must have as many equations as unknowns, but has {len(equations)} equations "
+                f"for {layout.size} unknowns."
+            )
+        return cls(system, args, form, layout, 0, equations)
+
+    @property
+    def size(self) -> int:
+        """The number of unknowns."""
+        return self.layout.size + self.extra
+
+    @property
+    def shown(self) -> Bool[np.ndarray, " n"]:
+        """Which unknowns are the user's."""
+        return np.arange(self.size) < self.layout.size
+
+    @property
+    def may_cancel(self) -> bool:
+        """Whether highest derivatives may cancel between equations: for a mechanism where constraints are redundant only."""
+        return not isinstance(self.system, ConstrainedSystem)
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """A name for each unknown."""
+        if isinstance(self.system, ImplicitDAE):
+            return tuple(f"y{n}" for n in self.layout.names())
+        letters = ("q", "v") if isinstance(self.system, ConstrainedSystem) else ("x", "z")
+        names = [letters[int(n[1])] + n[3:] for n in self.layout.names()]
+        multipliers = [f"multiplier[{i}]" for i in range(self.extra)]
+        return (*names, *multipliers)
+
+    def at_start(self, t: Any, state: Any) -> tuple["ResidualForm", Float[Array, " n"]]:
+        """The form in units of a mechanism's own, and the flat vector of a state with its multipliers.
+
+        The unit of a multiplier is the mass in the direction of its constraint, aᵀ M a / aᵀ a, over the length of a: then
+        neither the unit of mass nor a factor of the constraint makes a difference.
+        """
+        if not isinstance(self.system, ConstrainedSystem):
+            return self, self.encode(state)
+        ode = MechanicalODE.of(self.system, t, state, self.args)
+        flat = ode.encode(state)
+        a, mass = ode.constraint_jacobian(t, *flat), ode.mass(flat[0])
+        squares = jnp.sum(a * a, 1)
+        squares = jnp.where(squares > 0, squares, 1)
+        masses = jnp.ones_like(squares) if mass is None else jnp.sum(a * _weighted(mass, a.T).T, 1) / squares
+        # Where all that a constraint ties together is massless, that of the others has to do.
+        masses = jnp.where(masses > 0, masses, jnp.max(masses))
+        units = jax.lax.stop_gradient(jnp.where(masses > 0, masses, 1) / jnp.sqrt(squares))
+        multipliers = _multipliers(ode, t, flat, a, mass, units)
+        form = dataclasses.replace(self, units=jnp.concatenate([units, units])[: self.extra])
+        rest = jnp.zeros(self.extra - multipliers.size, a.dtype)
+        return form, jnp.concatenate([self.layout.flatten(state), multipliers, rest])
+
+    def encode(self, state: Any) -> Float[Array, " n"]:
+        """The flat vector of a state, multipliers 0."""
+        y = self.layout.flatten(state)
+        return jnp.concatenate([y, jnp.zeros(self.extra, y.dtype)]) if self.extra else y
+
+    def decode(self, t: Any, y: Float[Array, " n"]) -> Any:
+        """The state in the user's structure."""
+        return self.layout.unflatten(y[: self.layout.size])
+
+    @property
+    def may_be_nonlinear(self) -> bool:
+        """Whether ẏ may occur other than linearly."""
+        return isinstance(self.system, ImplicitDAE)
+
+    @property
+    def rates_are_given(self) -> bool:
+        """Whether the user said what ẏ is near at the start."""
+        return isinstance(self.system, ImplicitDAE) and self.system.yd0 is not None
+
+    def known_rates(self, y: Float[Array, " n"]) -> Float[Array, " n"]:
+        """What is known of ẏ: what the user said of it, else nothing, 0."""
+        if isinstance(self.system, ImplicitDAE) and self.system.yd0 is not None:
+            return self.layout.flatten(self.system.yd0).astype(y.dtype)
+        return jnp.zeros_like(y)
+
+    @at_one_instant
+    def residual(self, t: Any, y: Float[Array, " n"], yd: Float[Array, " n"]) -> Float[Array, " n"]:
+        """F(t, y, ẏ)."""
+        system = self.system
+        if isinstance(system, ConstrainedSystem):
+            return self._mechanical(t, y, yd)
+        state, rates = self.layout.unflatten(y), self.layout.unflatten(yd)
+        if isinstance(system, ImplicitDAE):
+            return _flat(system.residual(t, state, rates, self.args), y.dtype)
+        (x, z), (xd, _) = state, rates
+        f = system.f(t, x, z, self.args)
+        return jnp.concatenate([_flat(xd, y.dtype) - _flat(f, y.dtype), _flat(system.g(t, x, z, self.args), y.dtype)])
+
+    def _mechanical(self, t: Any, y: Float[Array, " n"], yd: Float[Array, " n"]) -> Float[Array, " n"]:
+        assert isinstance(self.system, ConstrainedSystem)
+        ode = MechanicalODE.of(self.system, t, self.layout.unflatten(y[: self.layout.size]), self.args)
+        n, m, p = ode.layout.size, ode.holonomic, ode.nonholonomic
+        q, v = y[:n], y[n : 2 * n]
+        multipliers, eta = jnp.split(y[2 * n :] if self.units is None else y[2 * n :] * self.units, [m + p])
+        a, mass = ode.constraint_jacobian(t, q, v), ode.mass(q)
+        momentum = _weighted(mass, yd[n : 2 * n]) - ode.force(t, q, v) + jnp.sum(multipliers[:, None] * a, 0)
+        velocity = ode.velocity_constraint(t, q, v)
+        kinematics = yd[:n] - v
+        if self.form == "index-3":
+            return jnp.concatenate([kinematics, momentum, ode.constraint(t, q), velocity[m:]])
+        if self.form == "index-2":
+            return jnp.concatenate([kinematics, momentum, velocity])
+        stabilised = _weighted(mass, kinematics) + jnp.sum(eta[:, None] * a[:m], 0)
+        return jnp.concatenate([stabilised, momentum, velocity, ode.constraint(t, q)])
+
+
+def _weighted(mass: Float[Array, "..."] | None, x: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
+    """M x."""
+    if mass is None:
+        return x
+    if mass.ndim < 2:
+        return mass * x if x.ndim < 2 else (mass * x.T).T
+    return jnp.sum(mass * x, 1) if x.ndim < 2 else row_products(mass, x.T)
+
+
+def _multipliers(ode: MechanicalODE, t: Any, y: Any, a: Any, mass: Any, units: Any) -> Float[Array, " c"]:
+    """λ at a state, in its `units`, from M v̇ + Aᵀλ = f and A v̇ = −γ: M may be singular."""
+    n, c = ode.layout.size, len(a)
+    if mass is None or n + c > BORDERED:
+        return ode.multipliers(t, y) / units
+    momentum = jnp.concatenate([_weighted(mass, jnp.eye(n, dtype=a.dtype)), a.T * units], 1)
+    matrix = jnp.concatenate([momentum, jnp.concatenate([a, jnp.zeros((c, c), a.dtype)], 1)])
+    right = jnp.concatenate([ode.force(t, *y), -ode.bias(t, *y)])
+    largest = jnp.max(jnp.abs(matrix), 1)
+    scale = 1 / jnp.where(largest > 0, largest, 1)
+    return solve(matrix * scale[:, None], right * scale)[n:]
+
+
+def _names(stem: str, out: Any) -> tuple[str, ...]:
+    shapes = jax.tree.map(lambda s: np.zeros(s.shape), out)
+    return tuple(stem + name for name in Layout.of(shapes).names())
+
+
+def _flat(tree: Any, dtype: Any) -> Float[Array, " n"]:
+    leaves = [jnp.ravel(jnp.asarray(leaf, dtype)) for leaf in jax.tree.leaves(tree)]
+    return jnp.concatenate(leaves) if len(leaves) > 1 else leaves[0]

@@ -1,0 +1,383 @@
+"""The underlying ODE of any system 0 = F(t, y, ẏ), from the offsets of its structural analysis."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from ..linalg import (
+    Tearing,
+    fixed_point,
+    implicit_root,
+    relative_change,
+    row_products,
+    semidefinite_solve,
+    solve,
+    take,
+    tearing,
+)
+from ..structure import interpreted
+from ..systems import ConstrainedSystem
+from .constraints import ManifoldODE, MechanicalODE, at_one_instant
+from .derivative_orders import Combination, derivative_of, find_offsets
+from .initial_rates import is_nonlinear, rates_of
+from .residual_form import ResidualForm
+from .taylor import total_derivatives
+
+
+# Gauss–Newton's method for the derivatives of the initial state.
+STARTING = 100
+# How much more the derivatives may move there than the values: these are what is given.
+FREE = 1e3
+# A selection of states is kept until its smallest pivot is less than this part of the best one's.
+HYSTERESIS = 0.3
+
+
+@dataclasses.dataclass(frozen=True)
+class Orders:
+    """How often each equation is differentiated, C, and each variable, D. Compared by value.
+
+    The state of the underlying ODE holds, of each variable j, the derivatives of orders 0 to Dⱼ − 1.
+    """
+
+    equations: tuple[int, ...]
+    variables: tuple[int, ...]
+
+    @functools.cached_property
+    def places(self) -> list[Int[np.ndarray, " n"]]:
+        """For each order k, where y^(k) of each variable is in (Y, X), X the derivatives of order Dⱼ; −1 beyond."""
+        d = np.array(self.variables)
+        found, start = [], 0
+        for k in range(d.max() + 1):
+            inside = d > k
+            found.append(
+                np.where(inside, start + np.cumsum(inside) - 1, np.where(d == k, self.size + np.arange(len(d)), -1))
+            )
+            start += int(inside.sum())
+        return found
+
+    @functools.cached_property
+    def derivatives(self) -> Int[np.ndarray, " N"]:
+        """Where in (Y, X) the derivative of each entry of Y is."""
+        d = np.array(self.variables)
+        return np.concatenate([self.places[k + 1][d > k] for k in range(d.max())])
+
+    @functools.cached_property
+    def values(self) -> Int[np.ndarray, " N"]:
+        """Which variable each entry of Y is the value of, −1 for derivatives."""
+        first = np.flatnonzero(np.array(self.variables) > 0)
+        return np.concatenate([first, np.full(self.size - len(first), -1)])
+
+    @property
+    def first_derivatives(self) -> Int[np.ndarray, " N"]:
+        """Which variable each entry of Y is the first derivative of, −1 for others."""
+        found = np.full(self.size, -1)
+        for j, d in enumerate(self.variables):
+            if d > 1:
+                found[self.places[1][j]] = j
+        return found
+
+    @property
+    def size(self) -> int:
+        """The number of entries of Y."""
+        return sum(self.variables)
+
+    def rows(self, level: int) -> Int[np.ndarray, " rows"]:
+        """The equations whose derivative of order `level` is an invariant."""
+        return np.flatnonzero(np.array(self.equations) > level)
+
+    def dummies(self, k: int) -> Int[np.ndarray, " n"]:
+        """Where in Y the derivative of order Dⱼ − k of each variable is, a dummy derivative at level k; −1: nowhere."""
+        return np.array([self.places[d - k][j] if d >= k else -1 for j, d in enumerate(self.variables)])
+
+
+class StructuralODE(ManifoldODE):
+    """From the offsets c of the equations and d of the variables (Pryce's Σ-method): the equations Fᵢ^(Cᵢ) = 0 are linear
+    in the derivatives X of order Dⱼ and give these, the state Y holds the lower ones, and
+
+        H = (Fᵢ^(k), k < Cᵢ) = 0
+
+    are the invariants: the constraints and the hidden ones. C = c and D = d where Fᵢ^(cᵢ) is linear in X; else, and where
+    a derivative of order 0 would have to be found from a nonlinear equation, each is differentiated once more. Where
+    highest derivatives cancel between equations, F stands for their `combination`.
+
+    Source: J. D. Pryce, BIT 41 (2001), 364–394.
+    """
+
+    form: ResidualForm
+    combination: Combination = eqx.field(static=True)
+    orders: Orders = eqx.field(static=True)
+    tearing: Tearing = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, form: ResidualForm, dtype: Any, complete: bool = False) -> "StructuralODE":
+        """Finds the offsets while tracing. `complete`: once more than needed, so that all variables are in the state and
+        all that restricts them is among the invariants.
+
+        Errors: `ValueError` for a structurally singular system.
+        """
+        found = find_offsets(form, dtype)
+        offsets = found.sigma.equation_offsets, found.sigma.variable_offsets
+
+        def differentiated(more: int) -> "StructuralODE":
+            return cls(form, found.combination, Orders(*(tuple(k + more for k in c) for c in offsets)), Tearing())
+
+        if complete:
+            return differentiated(1)
+        ode = differentiated(0)
+        linear, known = ode._coefficients(dtype) if max(found.sigma.variable_offsets) else (False, np.zeros(0))
+        if not linear:
+            ode = differentiated(1)
+            _, known = ode._coefficients(dtype)
+        present = np.zeros_like(known, bool)
+        for i, variables in enumerate(found.pattern):
+            present[i, variables] = True
+        return dataclasses.replace(ode, tearing=tearing(np.where(present, known, 0)))
+
+    def _coefficients(self, dtype: Any) -> tuple[bool, Float[np.ndarray, "n n"]]:
+        """Whether the highest derivatives enter linearly, that is whether their coefficients do not depend on them, and
+        which of these are numbers.
+        """
+        time, state, y = (jax.ShapeDtypeStruct(shape, dtype) for shape in ((), (self.orders.size,), (self.form.size,)))
+        coefficients = lambda t, s, x: jax.jacfwd(lambda x: self.of_highest_order(t, s, x))(x)
+        (*_, on_highest), known = interpreted(coefficients, time, state, y, derivative=True)
+        return not on_highest.any(), known.reshape(self.form.size, self.form.size)
+
+    # The equations and their derivatives
+
+    @property
+    def equations(self) -> tuple[str, ...]:
+        """A name for each equation."""
+        return self.combination.names(self.form.equations)
+
+    def levels(self, t: Any, y: Float[Array, " N"], x: Float[Array, " n"], count: int) -> list[Float[Array, " n"]]:
+        """F, dF/dt, … at (Y, X): `count` of them, each right in the equations of which only Y and X are needed."""
+        both = jnp.concatenate([y, x])
+        orders = [take(both, place) for place in self.orders.places]
+        more = count + self.combination.degree
+        return self.combination.of(total_derivatives(self.form.residual, jnp.asarray(t, y.dtype), orders, more))
+
+    def of_highest_order(self, t: Any, y: Any, x: Any) -> Float[Array, " n"]:
+        """Fᵢ^(Cᵢ)."""
+        return self.highest_of(self.levels(t, y, x, max(self.orders.equations) + 1))
+
+    def highest_of(self, levels: list[Float[Array, " n"]]) -> Float[Array, " n"]:
+        """Fᵢ^(Cᵢ) of all the derivatives of F."""
+        return jnp.stack([levels[k][i] for i, k in enumerate(self.orders.equations)])
+
+    @at_one_instant
+    def _system(self, t: Any, y: Any, feedback: Any) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
+        """The matrix and the right-hand side of the equations for X."""
+        zero = jnp.zeros(self.form.size, y.dtype)
+        right = -self.of_highest_order(t, y, zero)
+        if feedback is not None and any(self.orders.equations):
+            levels = self.levels(t, y, zero, max(self.orders.equations, default=0))
+            terms = [
+                feedback(*(levels[k][i] for k in range(c))) if c else 0 for i, c in enumerate(self.orders.equations)
+            ]
+            right = right - jnp.stack([jnp.asarray(term, y.dtype) for term in terms])
+        return jax.jacfwd(lambda x: self.of_highest_order(t, y, x))(zero), right
+
+    def highest(self, t: Any, y: Float[Array, " N"], feedback: Any = None) -> Float[Array, " n"]:
+        """X, the derivatives of order Dⱼ."""
+        return self.tearing.solve(*self._system(t, y, feedback))
+
+    # The underlying ODE and the manifold
+
+    def field(self, t: Any, y: Any, feedback: Any = None) -> Any:
+        both = jnp.concatenate([y, self.highest(t, y, feedback)])
+        return take(both, self.orders.derivatives)
+
+    @at_one_instant
+    def invariants(self, t: Any, y: Any) -> tuple[Float[Array, " levels"], ...]:
+        highest = max(self.orders.equations)
+        if not highest:
+            return (jnp.zeros(0, y.dtype),)
+        levels = self.levels(t, y, jnp.zeros(self.form.size, y.dtype), highest)
+        return tuple(take(level, self.orders.rows(k)) for k, level in enumerate(levels))
+
+    @property
+    def invariant_names(self) -> tuple[str, ...]:
+        """A name for each invariant."""
+        names = self.equations
+        return tuple(derivative_of(names[i], k) for k in range(max(self.orders.equations)) for i in self.orders.rows(k))
+
+    def violations(self, t: Any, y: Any) -> Float[Array, " m"]:
+        """H(t, Y), all levels."""
+        return jnp.concatenate(self.invariants(t, y))
+
+    @at_one_instant
+    def normals(self, t: Any, y: Any) -> Float[Array, "m N"]:
+        """∂H/∂Y, whose rows are normal to the manifold in the metric in which all entries of Y count alike."""
+        return jax.jacfwd(self.violations, 1)(t, y)
+
+    def tangent(self, dy: Any, normals: Float[Array, "m N"]) -> Any:
+        if not len(normals):
+            return dy
+        gram = row_products(normals, normals)
+        return dy - self.shift(0, normals, semidefinite_solve(gram, jnp.sum(normals * dy, 1)))
+
+    def shift(self, y: Any, normals: Any, mu: Float[Array, " m"]) -> Any:
+        return y + jnp.sum(normals * mu[:, None], 0)
+
+    def restore(self, t: Any, y: Any, normals: Any) -> tuple[Any, Bool[Array, ""]]:
+        if not len(normals):
+            return y, jnp.asarray(True)
+
+        def iterate(params: Any) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
+            ode, t, y, normals = params
+
+            def correct(mu: Any) -> tuple[Any, Any]:
+                here = ode.shift(y, normals, mu)
+                matrix = row_products(ode.normals(t, here), normals)
+                delta = solve(matrix, ode.violations(t, here))
+                return mu - delta, relative_change(ode.shift(0, normals, delta), here)
+
+            return fixed_point(correct, jnp.zeros(len(normals), y.dtype))
+
+        residual = lambda mu, params: params[0].violations(params[1], params[0].shift(params[2], params[3], mu))
+        mu, found = implicit_root(residual, iterate, (self, t, y, normals))
+        return self.shift(y, normals, mu), found
+
+    def selection(self, t: Any, y: Any, chosen: Any) -> tuple[Float[Array, "m N"], Bool[Array, ""]]:
+        """Unit directions of the dummy derivatives, entries of Y that H = 0 determines given the others, and whether they
+        are not `chosen`.
+
+        Level by level, from the highest: the equations with Cᵢ ≥ k determine the derivatives of order Dⱼ − k of as many
+        variables, taken by complete pivoting on the system Jacobian from those that the level before has taken.
+        """
+        d = np.array(self.orders.variables)
+        matrix = lax.stop_gradient(self._system(t, y, None)[0])
+        largest = jnp.max(jnp.abs(matrix), 1, keepdims=True)
+        matrix = matrix / jnp.where(largest > 0, largest, 1)
+        infinite = jnp.asarray(jnp.inf, y.dtype)
+        available, quality, present, first, directions = jnp.ones(len(d), y.dtype), infinite, infinite, 0, []
+        for k in range(1, max(self.orders.equations) + 1):
+            rows = self.orders.rows(k - 1)
+            place = self.orders.dummies(k)
+            level = jnp.stack([matrix[i] for i in rows]) * (d >= k)
+            taken, smallest = _pivots(level * available)
+            quality, available = jnp.minimum(quality, smallest), jnp.sum(taken, 0)
+            embedding = np.zeros((len(d), y.size))
+            embedding[place >= 0, place[place >= 0]] = 1
+            directions.append(jnp.sum(taken[:, :, None] * jnp.asarray(embedding, taken.dtype), 1))
+            if chosen is not None:
+                _, smallest = _pivots(level * take(jnp.sum(chosen[first : first + len(rows)], 0), place))
+                present = jnp.minimum(present, smallest)
+            first += len(rows)
+        best = jnp.concatenate(directions) if directions else jnp.zeros((0, y.size), y.dtype)
+        if chosen is None or not directions:
+            return best, jnp.asarray(False)
+        keep = present >= HYSTERESIS * quality
+        return jnp.where(keep, chosen, best), ~keep
+
+    # The user's state
+
+    def decode(self, t: Any, y: Any) -> Any:
+        count = self.form.layout.size
+        algebraic = 0 in self.orders.variables[:count]
+        both = jnp.concatenate([y, self.highest(t, y)]) if algebraic else y
+        return self.form.decode(t, take(both, self.orders.places[0][:count]))
+
+    def encode(self, t: Any, state: Any) -> Float[Array, " N"]:
+        """Y of a state: the derivatives of order 1 and higher are those with which the equations hold, or nearly hold."""
+        values = self.form.encode(state)
+        guess = rates_of(self.form, t, values)[0] if is_nonlinear(self.form, values.dtype) else None
+        return self.start(t, values, jnp.zeros(self.form.size), guess=guess)
+
+    def start(
+        self,
+        t: Any,
+        values: Float[Array, " n"],
+        freedom: Float[Array, " n"],
+        rates: Float[Array, " n"] | None = None,
+        guess: Float[Array, " n"] | None = None,
+    ) -> Float[Array, " N"]:
+        """Y near the values of the variables, each of which may move as much as its `freedom` says (0: not at all; 1: no
+        more than the others), with the least H. Gauss–Newton's method, the derivatives from 0 or, the first ones, from
+        `guess`; these are `rates` where that is given.
+        """
+        index = self.orders.values
+        weights = take(freedom.astype(values.dtype), index) + jnp.asarray(np.where(index < 0, FREE, 0), values.dtype)
+        known = take(values, index)
+        first = self.orders.first_derivatives
+        guess = self.form.known_rates(values) if guess is None else guess
+        known = known + take(guess if rates is None else rates, first)
+        if rates is not None:
+            weights = jnp.where(first < 0, weights, 0)
+        return _nearest(self, t, known, weights)
+
+
+def _nearest(ode: StructuralODE, t: Any, known: Any, weights: Any) -> Any:
+    if not any(ode.orders.equations):
+        return known
+
+    def moved(y: Any, start: Any, params: Any) -> Any:
+        """The point next to `start` on the linearisation of H = 0 at y."""
+        ode, t, _, weights, *_ = params
+        a, h = ode.normals(t, y), ode.violations(t, y)
+        largest = jnp.max(jnp.abs(a * weights), 1)
+        scale = 1 / jnp.where(largest > 0, largest, 1)
+        a, off = a * scale[:, None], scale * (h + jnp.sum(a * (start - y), 1))
+        gram = row_products(a * weights, a * weights)
+        # What the free entries cannot mend stays as it is, in place of growing without bound.
+        cut = 100 * jnp.finfo(y.dtype).eps * jnp.maximum(jnp.trace(gram), 1)
+        return start - weights**2 * jnp.sum(a * solve(gram + cut * jnp.eye(len(h), dtype=y.dtype), off)[:, None], 0)
+
+    def materialised(params: Any, y: Any, towards: Any) -> Any:
+        def correct(y: Any) -> Any:
+            new = moved(y, towards(y), params)
+            return new, relative_change(new - y, y)
+
+        return fixed_point(correct, y, max_steps=STARTING)
+
+    # Derivatives have nothing to be near to but what the equations make of them; the rest of a pull keeps those that the
+    # equations leave open from being undetermined.
+    is_value = ode.orders.values >= 0
+    pull = jnp.finfo(known.dtype).eps ** 0.6
+    aim = lambda y, params: jnp.where(is_value, params[2], y - pull * (y - params[4]))
+
+    def iterate(params: Any) -> Any:
+        # The nearest point, then what `cut` has left of H there.
+        near, _ = materialised(params, params[4], lambda y: aim(y, params))
+        return materialised(params, near, lambda y: y)
+
+    first, _ = materialised((ode, t, known, weights), known, lambda y: jnp.where(is_value, known, y))
+    params = (ode, t, known, weights, lax.stop_gradient(first))
+    return implicit_root(lambda y, p: y - moved(y, aim(y, p), p), iterate, params)[0]
+
+
+def _pivots(a: Float[Array, "m N"]) -> tuple[Float[Array, "m N"], Float[Array, ""]]:
+    """The columns that elimination with complete pivoting takes, as unit rows, and the smallest pivot."""
+    m, n = a.shape
+
+    def eliminate(k: Any, carry: Any) -> Any:
+        a, taken, smallest = carry
+        place = jnp.argmax(jnp.abs(a).reshape(-1))
+        at_row, at_column = (jnp.arange(m) == place // n)[:, None], jnp.arange(n) == place % n
+        row = jnp.sum(jnp.where(at_row, a, 0), 0)
+        column = jnp.sum(jnp.where(at_column, a, 0), 1, keepdims=True)
+        pivot = jnp.sum(jnp.where(at_column, row, 0))
+        reduced = a - column * (row / jnp.where(pivot == 0, 1, pivot))
+        a = jnp.where(at_row | at_column, 0, reduced)
+        taken = jnp.where((jnp.arange(m) == k)[:, None], jnp.where(at_column, 1, 0).astype(a.dtype), taken)
+        return a, taken, jnp.minimum(smallest, jnp.abs(pivot))
+
+    infinite = jnp.asarray(jnp.inf, a.dtype)
+    _, taken, smallest = lax.fori_loop(0, m, eliminate, (a, jnp.zeros_like(a), infinite))
+    return taken, smallest
+
+
+def underlying_ode(system: Any, t: Any, state: Any, args: Any, rank: int | None = None) -> tuple[Any, ManifoldODE]:
+    """The state and the underlying ODE of any system; a mechanism's is found faster than from the offsets."""
+    if isinstance(system, ConstrainedSystem):
+        mechanical = MechanicalODE.of(system, t, state, args, rank)
+        return mechanical.encode(state), mechanical
+    ode = StructuralODE.of(ResidualForm.of(system, t, state, args), jnp.result_type(*jax.tree.leaves(state)))
+    return ode.encode(t, state), ode

@@ -1,0 +1,91 @@
+"""What to keep of a solve in a sweep: numbers, so that memory does not grow with the steps."""
+
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..consistent import consistent_state
+from ..diagnostics import drift, energy
+from ..solution import RESULTS, DAESolution
+from ..solve import daesolve
+from ..systems import ConstrainedSystem, System
+
+
+def final_state(sol: DAESolution) -> Any:
+    """The last saved state; also `sol.final`."""
+    return sol.final
+
+
+def largest_drift(system: System, sol: DAESolution) -> Float[Array, ""]:
+    """The largest of the levels of `drift` over the saved times, max |(g, ġ, h)| of a mechanism."""
+    return jnp.max(jnp.stack(drift(system, sol).levels))
+
+
+def energy_error(system: ConstrainedSystem, sol: DAESolution) -> Float[Array, ""]:
+    """max |E(t) − E(t₀)| over the saved times, in the unit of the energy; t₀ the first of them."""
+    total = energy(system, sol)
+    return jnp.max(jnp.abs(total - total[0]))
+
+
+def largest_error(sol: DAESolution, reference: Any) -> Float[Array, ""]:
+    """max |y − reference| over the saved times, infinite where the solve failed; `reference` has the structure of `sol.ys`."""
+
+    def largest(y: Any, r: Any) -> Any:
+        saved = jnp.isfinite(sol.ts).reshape(-1, *(1,) * (y.ndim - 1))
+        return jnp.max(jnp.where(saved, jnp.abs(y - r), 0))
+
+    error = jnp.max(jnp.stack(jax.tree.leaves(jax.tree.map(largest, sol.ys, reference))))
+    went_well = (sol.result == RESULTS.successful) | (sol.result == RESULTS.event_occurred)
+    return jnp.where(went_well, error, jnp.inf)
+
+
+def first_time(ts: Float[Array, " times"], happened: Bool[Array, " times"]) -> Float[Array, ""]:
+    """The first of the times at which something has happened; infinite where it has not."""
+    return jnp.min(jnp.where(happened, ts, jnp.inf))
+
+
+def first_flip(ts: Float[Array, " times"], arm: Float[Array, "times 2"]) -> Float[Array, ""]:
+    """When an arm (x, y), y down, first turns over the top: its angle, followed from saved time to saved time, leaves
+    (−π, π). Infinite where it does not; late by at most the distance of the saved times, which must be short beside the
+    time of half a turn.
+    """
+    angle = jnp.unwrap(jnp.arctan2(arm[:, 0], arm[:, 1]))
+    return first_time(ts, jnp.abs(angle) >= jnp.pi)
+
+
+def lyapunov(
+    system: ConstrainedSystem,
+    solver: diffrax.AbstractSolver,
+    t0: Any,
+    t1: Any,
+    y0: Any,
+    args: Any = None,
+    *,
+    direction: Any = None,
+    **options: Any,
+) -> Float[Array, ""]:
+    """The finite-time Lyapunov exponent, log(|δy(t₁)| / |δy(t₀)|) / (t₁ − t₀), in 1/s.
+
+    δy is the derivative of the solution (tangent dynamics, by `jax.jvp`) in one direction, which is made consistent with
+    the constraints and the hidden ones: `direction`, with the structure of `y0`, by default 1 everywhere. `options` are
+    those of `daesolve`.
+    """
+    along = jax.tree.map(jnp.ones_like, y0) if direction is None else direction
+    _, start = jax.jvp(lambda y: consistent_state(system, t0, y, args), (y0,), (along,))
+
+    def end(y: Any) -> Any:
+        sol = daesolve(
+            system, solver, t0, t1, options.get("dt0"), y, args, adjoint=diffrax.ForwardMode(),
+            **{name: value for name, value in options.items() if name != "dt0"},
+        )  # fmt: skip
+        return final_state(sol)
+
+    _, last = jax.jvp(end, (y0,), (start,))
+    return jnp.log(_norm(last) / _norm(start)) / (t1 - t0)
+
+
+def _norm(tree: Any) -> Float[Array, ""]:
+    return jnp.sqrt(sum(jnp.sum(x**2) for x in jax.tree.leaves(tree)))

@@ -1,0 +1,253 @@
+"""`sweep`: a function of one element over many, in chunks, on all cores and devices, resumable."""
+
+import dataclasses
+import functools
+import hashlib
+import os
+import re
+import sys
+from collections import Counter
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import PyTree
+
+from ..driver.failures import sentence_of
+from ..solution import RESULTS
+from ..validate.states import brief
+from .progress import Progress
+from .sweep_store import Memory, Store
+
+
+# Lanes of one chunk and device. On a CPU lanes run a vector at a time, so that a chunk only has to outweigh the 0.1 ms of
+# its start; on an accelerator they run in step.
+LANES = {"cpu": 512}
+LANES_OF_ACCELERATOR = 8192
+
+
+@dataclasses.dataclass(frozen=True)
+class Grid:
+    """All combinations of the values of named axes; see `grid`."""
+
+    axes: dict[str, np.ndarray]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The number of values of each axis."""
+        return tuple(len(x) for x in self.axes.values())
+
+    def elements(self) -> dict[str, np.ndarray]:
+        """The combinations, the last axis fastest: one array for each name, with one leading axis."""
+        return {
+            name: x.ravel() for name, x in zip(self.axes, np.meshgrid(*self.axes.values(), indexing="ij"), strict=True)
+        }
+
+
+def grid(**axes: Any) -> Grid:
+    """A grid for `sweep`: `grid(alpha=..., beta=...)`. The function gets {"alpha": α, "beta": β}, the results have a
+    leading axis for each name, in this order.
+
+    Errors: `ValueError` for an axis that is not one-dimensional or is empty.
+    """
+    if not axes:
+        raise ValueError("`grid` needs at least one axis, such as alpha=jnp.logspace(-1, 4, 100).")
+    arrays = {name: np.asarray(x) for name, x in axes.items()}
+    for name, x in arrays.items():
+        if x.ndim != 1 or not x.size:
+            raise ValueError(f"`{name}` must be a sequence of numbers, but has the shape {x.shape}.")
+    return Grid(arrays)
+
+
+def sweep(
+    fn: Callable[[Any], PyTree],
+    inputs: PyTree | Grid,
+    *,
+    chunk_size: int | None = None,
+    devices: Sequence[Any] | None = None,
+    progress: bool = True,
+    store: str | os.PathLike[str] | None = None,
+) -> PyTree:
+    """fn(element) for every element along the leading axis of `inputs`.
+
+    **Arguments**
+
+    - `fn`: any JAX function of one element to a pytree of arrays, usually a `daesolve(..., throw=False)` and what is to
+      be kept of it: a final state, a maximum of the drift, an energy error. What it returns is all that is kept.
+    - `inputs`: a pytree of arrays with a common leading axis, or a `grid`.
+    - `chunk_size`: elements of one compiled call; by default 128 for each CPU device, 8192 for each accelerator.
+    - `devices`: by default all of this process. On one CPU device several chunks run at once, one for each core.
+    - `progress`: a bar on stderr, with the rate, the time left, and how many solves failed; at the end, why.
+    - `store`: a folder. Results are written there as they come; the same sweep with the same folder goes on where it was
+      interrupted, also by a kill, and ends with the same bits. The result's arrays are then files mapped into memory.
+
+    Under `jax.distributed.initialize` every process computes its share and all return the whole; `store` must then be a
+    folder that all see.
+
+    **Returns** the results as numpy arrays with a leading axis of elements, or of the grid's shape. A solve that fails
+    does not stop the others: return `sol.result` from `fn`, and it becomes an array of codes to compare, as in
+    `out.result == dae_jax.RESULTS.successful`.
+
+    Errors: `ValueError` for inputs without a common leading axis, and for a store of another sweep; `OSError` before the
+    work starts where the store cannot be written or there is no room for it.
+    """
+    if not callable(fn):
+        raise TypeError(f"`fn` must be a function of one element, but is {brief(fn)}.")
+    elements = inputs.elements() if isinstance(inputs, Grid) else jax.tree.map(np.asarray, inputs)
+    size = _leading(elements)
+    devices = list(devices or jax.local_devices())
+    lanes = (
+        LANES.get(devices[0].platform, LANES_OF_ACCELERATOR) if chunk_size is None else -(-chunk_size // len(devices))
+    )
+    if lanes < 1:
+        raise ValueError(f"`chunk_size` must be at least 1, but is {chunk_size}.")
+    lanes = min(lanes, -(-size // len(devices)))
+    chunk = lanes * len(devices)
+    call, out = _compiled(fn, elements, chunk, devices)
+    leaves, structure = jax.tree.flatten(out)
+    leaves = [jax.ShapeDtypeStruct((size, *x.shape[1:]), x.dtype) for x in leaves]
+    chunks = -(-size // chunk)
+    kept = (
+        Memory(leaves, chunks)
+        if store is None
+        else Store.open(Path(store), leaves, chunks, _fingerprint(fn, elements, chunk))
+    )
+    failures = _failures(structure)
+    progress = progress and jax.process_index() == 0
+    with Progress("sweep", size, progress, chunk * int(np.sum(kept.done))) as shown:
+        _run(call, elements, chunk, kept, devices, lambda: shown.show(*_state(kept, chunk, size, failures)))
+    arrays = kept.collect(_gathered if jax.process_count() > 1 else None, chunk)
+    for code, count in failures(arrays).most_common() if progress else ():
+        print(f"  {count:,} × {_message(code)}", file=sys.stderr)
+    if isinstance(inputs, Grid):
+        arrays = [x.reshape(*inputs.shape, *x.shape[1:]) for x in arrays]
+    return jax.tree.unflatten(structure, arrays)
+
+
+def _leading(elements: Any) -> int:
+    shapes = [x.shape for x in jax.tree.leaves(elements)]
+    sizes = {s[0] if s else None for s in shapes}
+    if len(sizes) != 1 or None in sizes or 0 in sizes:
+        raise ValueError(
+            f"`inputs` must be arrays with a common leading axis that is not empty, but have the shapes {shapes}."
+        )
+    return shapes[0][0]
+
+
+def _compiled(fn: Any, elements: Any, chunk: int, devices: list[Any]) -> tuple[Any, Any]:
+    """The compiled function of one chunk, and the shapes of its results."""
+    batched, placed = _batched(fn, tuple(devices))
+    shape = lambda x: jax.ShapeDtypeStruct(
+        (chunk, *x.shape[1:]), jax.dtypes.canonicalize_dtype(x.dtype), sharding=placed
+    )
+    lowered = batched.lower(jax.tree.map(shape, elements))
+    compiled = lowered.compile()
+    return lambda part: compiled(jax.device_put(part, placed)), lowered.out_info
+
+
+@functools.lru_cache(maxsize=16)
+def _batched(fn: Any, devices: tuple[Any, ...]) -> tuple[Any, NamedSharding]:
+    """`fn` over a chunk that is spread over the devices. Remembered, so that the same sweep compiles once."""
+    spec = PartitionSpec("lanes")
+    mesh = Mesh(np.array(devices), ("lanes",))
+    batched = jax.vmap(fn)
+    if len(devices) > 1:
+        batched = jax.shard_map(batched, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
+    return jax.jit(batched), NamedSharding(mesh, spec)
+
+
+def _run(call: Any, elements: Any, chunk: int, kept: Any, devices: list[Any], report: Callable[[], None]) -> None:
+    """All chunks of this process that are not done, several at once: what is no kernel of ours may take one core only."""
+    size = jax.tree.leaves(elements)[0].shape[0]
+    mine = [c for c in np.flatnonzero(~kept.done) if c % jax.process_count() == jax.process_index()]
+    workers = max(len(os.sched_getaffinity(0)) // len(devices), 1) if devices[0].platform == "cpu" else 2
+
+    def work(c: int) -> tuple[int, list[np.ndarray]]:
+        # The last chunk is filled with its last element, so that one compiled function serves all.
+        at = np.minimum(np.arange(c * chunk, (c + 1) * chunk), size - 1)
+        out = call(jax.tree.map(lambda x: x[at], elements))
+        count = min(chunk, size - c * chunk)
+        return c, [np.asarray(x)[:count] for x in jax.tree.leaves(out)]
+
+    with ThreadPoolExecutor(workers) as pool:
+        waiting: set[Future[Any]] = set()
+        todo = iter(mine)
+        try:
+            while True:
+                while len(waiting) < 2 * workers and (c := next(todo, None)) is not None:
+                    waiting.add(pool.submit(work, int(c)))
+                if not waiting:
+                    return
+                finished, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+                for future in finished:
+                    c, rows = _result(future)
+                    kept.put(c, c * chunk, rows)
+                report()
+        finally:
+            for future in waiting:
+                future.cancel()
+
+
+def _result(future: Future[Any]) -> Any:
+    try:
+        return future.result()
+    except jax.errors.JaxRuntimeError as error:
+        sentence = sentence_of(error)
+        if sentence is None:
+            raise
+        raise RuntimeError(
+            f"{sentence}\nIn a sweep call `daesolve(..., throw=False)` and return `sol.result`: an element that fails does not "
+            "stop the others then."
+        ) from None
+
+
+def _failures(structure: Any) -> Callable[[list[np.ndarray]], Counter[int]]:
+    """How many elements have which result that is not a success, where the function returns results."""
+    numbered = jax.tree.unflatten(structure, range(structure.num_leaves))
+    is_result = lambda x: isinstance(x, type(RESULTS.successful))
+    places = [x._value for x in jax.tree.leaves(numbered, is_leaf=is_result) if is_result(x)]
+    okay = [int(code._value) for code in (RESULTS.successful, RESULTS.event_occurred)]
+
+    def count(arrays: list[np.ndarray]) -> Counter[int]:
+        if not places:
+            return Counter()
+        codes = np.concatenate([arrays[place].reshape(len(arrays[place]), -1) for place in places], axis=1)
+        failed = ~np.isin(codes, okay)
+        first = np.take_along_axis(codes, np.argmax(failed, 1)[:, None], 1)[failed.any(1)]
+        return Counter(dict(zip(*(x.tolist() for x in np.unique(first, return_counts=True)), strict=True)))
+
+    return count
+
+
+def _message(code: int) -> str:
+    return RESULTS[eqx.tree_at(lambda result: result._value, RESULTS.successful, np.asarray(code))]
+
+
+def _state(kept: Any, chunk: int, size: int, failures: Callable[[list[np.ndarray]], Counter[int]]) -> tuple[int, str]:
+    done = np.repeat(kept.done, chunk)[:size]
+    failed = failures([x[done] for x in kept.arrays]).total()
+    return int(done.sum()), f"{failed:,} failed" if failed else ""
+
+
+def _gathered(x: np.ndarray) -> np.ndarray:
+    """The array of every process, one below the other."""
+    return np.asarray(multihost_utils.process_allgather(x))
+
+
+def _fingerprint(fn: Any, elements: Any, chunk: int) -> str:
+    """What makes two sweeps the same: the function as it is traced, its constants, the elements, and the chunks."""
+    one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], jax.dtypes.canonicalize_dtype(x.dtype)), elements)
+    closed = jax.make_jaxpr(fn)(one)
+    found = hashlib.sha256(re.sub(r"0x[0-9a-f]+", "", str(closed)).encode())
+    for x in [*closed.consts, *jax.tree.leaves(elements)]:
+        x = np.asarray(x)
+        found.update(f"{x.dtype}{x.shape}".encode() + x.tobytes())
+    found.update(f"{chunk} {jax.__version__} {jnp.zeros(()).dtype}".encode())
+    return found.hexdigest()

@@ -1,0 +1,229 @@
+"""`tune`: gradient descent on positive parameters, many starts at once."""
+
+import functools
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, PyTree
+
+from ..validate.states import NUMBERS, brief
+from .progress import Progress
+
+
+if TYPE_CHECKING:  # half of the time that importing the library takes beyond diffrax
+    import optax
+
+
+# Up to this many parameters the derivative is taken in forward mode first: one tangent for each.
+FEW = 8
+# So many steps are one compiled call.
+BLOCK = 10
+
+
+class History(NamedTuple):
+    """A descent, step by step; every array has the leading axes (starts, steps).
+
+    - `loss`: where the descent was; `best`: the lowest loss until there.
+    - `params`: where it was.
+    - `gradient_norm`: |∂loss/∂log(params)|, before clipping.
+    """
+
+    loss: Float[Array, "starts steps"]
+    best: Float[Array, "starts steps"]
+    params: PyTree
+    gradient_norm: Float[Array, "starts steps"]
+
+    def __repr__(self) -> str:
+        """What it holds, in a line."""
+        starts, steps = self.loss.shape
+        return f"History(starts={starts}, steps={steps}, loss={self.loss[0, 0]:.6g} → {np.min(self.best):.6g})"
+
+
+class Tuned(NamedTuple):
+    """What `tune` returns.
+
+    - `params`, `loss`: the best point that any start visited, and its loss.
+    - `history`: see `History`.
+    - `evaluations`: what it cost, in evaluations of the loss: for each step one and, in forward mode, one for each
+      parameter (in reverse mode three, about what it costs).
+    """
+
+    params: PyTree
+    loss: Float[Array, ""]
+    history: History
+    evaluations: int
+
+    def __repr__(self) -> str:
+        """The point, what was gained and at what cost, in a line."""
+        params = jax.tree.map(_short, self.params)
+        return f"Tuned(params={params}, loss={self.loss:.6g}, history={self.history}, evaluations={self.evaluations})"
+
+
+class _Point(NamedTuple):
+    z: Float[Array, " parameters"]
+    state: Any
+    best_z: Float[Array, " parameters"]
+    best: Float[Array, ""]
+    stale: Any
+
+
+def tune(
+    loss: Callable[[Any], Any],
+    params: PyTree,
+    optimiser: "optax.GradientTransformation | None" = None,
+    *,
+    steps: int,
+    starts: int = 1,
+    progress: bool = True,
+    spread: float = 10.0,
+    patience: int = 30,
+    tolerance: float = 1e-3,
+    key: Any = None,
+) -> Tuned:
+    """Minimises loss(p) over positive parameters p by descent on z = log p:
+
+        z ← z + optimiser(∂loss/∂z),
+
+    so that a step changes every parameter by a factor and none becomes negative.
+
+    **Arguments**
+
+    - `loss`: a JAX function of `params` to a real number. Where the gradient comes from: up to 8 parameters forward
+      mode, else reverse mode, and the other mode where JAX refuses the first. A `daesolve` inside it needs
+      `adjoint=diffrax.ForwardMode()` for forward mode.
+    - `params`: any pytree of positive numbers: the first start.
+    - `optimiser`: any optax optimiser; by default the gradient clipped to norm 1, then Adam with Nesterov's momentum and a rate
+      that falls from 0.3 to 0.01 along a cosine.
+    - `steps`: at most so many; ends earlier where no start has improved by `tolerance` within `patience` steps.
+    - `starts`: how many descents run at once, batched. The others begin at `params` times factors drawn from
+      1/`spread` to `spread`, uniformly in the logarithm, with `key`.
+    - `progress`: whether a bar is shown on stderr.
+
+    A point where the loss or its gradient is not finite is never the best, and the descent goes half-way back to its
+    best point.
+
+    **Returns** a `Tuned`.
+
+    Errors: `ValueError` for parameters that are not positive, and where the loss is finite nowhere.
+    """
+    for tuned in descent(  # noqa: B007
+        loss, params, optimiser, steps=steps, starts=starts, progress=progress, spread=spread, patience=patience,
+        tolerance=tolerance, key=key,
+    ):  # fmt: skip
+        pass
+    return tuned
+
+
+def descent(
+    loss: Callable[[Any], Any],
+    params: PyTree,
+    optimiser: "optax.GradientTransformation | None" = None,
+    *,
+    steps: int,
+    starts: int = 1,
+    progress: bool = True,
+    spread: float = 10.0,
+    patience: int = 30,
+    tolerance: float = 1e-3,
+    key: Any = None,
+) -> Iterator[Tuned]:
+    """`tune`, with what was found so far after every few steps."""
+    if not callable(loss):
+        raise TypeError(f"`loss` must be a function of the parameters, but is {brief(loss)}.")
+    logs, unravel = ravel_pytree(jax.tree.map(_checked_log, params))
+    if steps < 1 or starts < 1:
+        raise ValueError(f"`steps` and `starts` must be at least 1, but are {steps} and {starts}.")
+    if optimiser is None:
+        import optax
+
+        rate = optax.cosine_decay_schedule(0.3, steps, 0.01 / 0.3)
+        optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.nadam(rate, b2=0.95))
+    key = jax.random.key(0) if key is None else key
+    factors = jax.random.uniform(key, (starts, logs.size), logs.dtype, -1, 1) * jnp.log(spread)
+    z = logs + factors.at[0].set(0)
+    point_at = lambda z: unravel(jnp.exp(z))
+    derivative, cost = _value_and_gradient(lambda z: loss(point_at(z)), logs)
+    advance = _compiled(derivative, point_at, optimiser, tolerance)
+    point = jax.vmap(lambda z: _Point(z, optimiser.init(z), z, jnp.asarray(jnp.inf, z.dtype), 0))(z)
+    records = []
+    with Progress("tune", steps, progress) as shown:
+        for done in range(0, steps, BLOCK):
+            point, record = advance(point, min(BLOCK, steps - done))
+            records.append(jax.tree.map(np.asarray, record))
+            best = float(jnp.min(point.best))
+            if not np.isfinite(best):
+                raise ValueError(f"`loss` or its gradient is not finite at any of the first {BLOCK} points.")
+            materialised = int(jnp.min(point.stale)) >= patience
+            shown.total = min(done + BLOCK, steps) if materialised else steps
+            shown.show(min(done + BLOCK, steps), f"best {best:.6g}{materialised * ', materialised'}")
+            history = History(*jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x, axis=1)), *records))
+            winner = int(jnp.argmin(point.best))
+            found = jax.tree.map(jnp.asarray, point_at(point.best_z[winner]))
+            yield Tuned(found, point.best[winner], history, history.loss.size * cost)
+            if materialised:
+                return
+
+
+def _short(x: Any) -> Any:
+    """A number to six digits, a few of them as a list, many as their shape."""
+    x = np.asarray(x)
+    if x.size > FEW:
+        return f"{x.dtype}{list(x.shape)}"
+    return np.vectorize(lambda number: float(f"{number:.6g}"), otypes=[float])(x).tolist()
+
+
+def _checked_log(p: Any) -> Any:
+    if not isinstance(p, NUMBERS) or not np.all(np.asarray(p) > 0) or not np.all(np.isfinite(np.asarray(p))):
+        raise ValueError(f"`params` must be positive and finite, but hold {p}.")
+    return jnp.log(jnp.asarray(p, jnp.result_type(float, p)))
+
+
+def _value_and_gradient(f: Callable[..., Any], z: Any) -> tuple[Callable[..., Any], int]:
+    """z → (f, ∂f/∂z) in the mode that suits and that JAX allows for f, and its cost in evaluations of f."""
+
+    def forward(z: Any) -> Any:
+        gradient, value = jax.jacfwd(lambda z: (f(z),) * 2, has_aux=True)(z)
+        return value, gradient
+
+    modes = [(forward, 1 + z.size), (jax.value_and_grad(f), 4)]
+    first, second = modes if z.size <= FEW else modes[::-1]
+    shape = jax.eval_shape(f, z)
+    if getattr(shape, "shape", None) != ():
+        raise ValueError(f"`loss` must return a real number, but returns {shape}.")
+    try:
+        jax.eval_shape(first[0], z)
+    except (TypeError, ValueError, NotImplementedError):
+        # Refused: diffrax's adjoints allow one mode each. If the second is refused too, that error is the one to see.
+        return second
+    return first
+
+
+def _compiled(
+    derivative: Callable[..., Any], point_at: Callable[..., Any], optimiser: Any, tolerance: float
+) -> Callable[..., Any]:
+    def step(point: _Point, _: Any) -> tuple[_Point, Any]:
+        value, gradient = derivative(point.z)
+        fine = jnp.isfinite(value) & jnp.all(jnp.isfinite(gradient))
+        better = fine & (value < point.best)
+        # The first finite loss is an improvement of any size.
+        improved = better & ~(point.best - value <= tolerance)
+        update, state = optimiser.update(gradient, point.state, point.z)
+        best_z, best = jnp.where(better, point.z, point.best_z), jnp.where(better, value, point.best)
+        after = _Point(
+            jnp.where(fine, point.z + update, (point.z + best_z) / 2),
+            jax.tree.map(lambda a, b: jnp.where(fine, a, b), state, point.state),
+            best_z,
+            best,
+            jnp.where(improved, 0, point.stale + 1),
+        )
+        return after, (value, best, point_at(point.z), jnp.linalg.norm(gradient))
+
+    @functools.partial(jax.jit, static_argnums=1)
+    def advance(point: _Point, count: int) -> tuple[_Point, Any]:
+        return jax.vmap(lambda p: jax.lax.scan(step, p, length=count))(point)
+
+    return advance

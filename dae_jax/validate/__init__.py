@@ -1,0 +1,1 @@
+"""What the user gives: wrong types, shapes and functions are refused in a sentence."""

@@ -1,0 +1,227 @@
+"""What the user's functions take and return, looked at without numbers: wrong ones are refused in a sentence."""
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..systems import ConstrainedSystem, ImplicitDAE, SemiExplicitDAE, System
+from .states import NUMBERS, describe
+
+
+TRACED = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+)
+LEADING_AXIS = (
+    "`y0` must be one state, but has a leading axis of length {}: a time axis as in `sol.ys`, or a batch. Go on from the last "
+    "saved state with `y0=sol.final`, that is `jax.tree.map(lambda x: x[-1], sol.ys)`; solve a batch with `jax.vmap`."
+)
+
+
+def refuse_wrong_functions(system: System, t: Any, state: Any, args: Any) -> None:
+    """Refuses functions of a system that cannot be called with (t, state, args), or return what does not fit the state.
+
+    Errors: `ValueError` in a sentence with the function's name, what it must return, what it returned, and what to do.
+    """
+    try:
+        _refuse(system, t, state, args)
+    except ValueError as refusal:
+        advice = time_axis_advice(system, t, state, args)
+        if not advice and any(type(x) is list for x in jax.tree.leaves(state, is_leaf=lambda x: type(x) is list)):
+            advice = "`y0` holds lists, which are no arrays: write jnp.array([1.0, 0.0]) in place of [1.0, 0.0]."
+        if advice:
+            raise ValueError(f"{advice}\n({refusal})") from refusal
+        raise
+
+
+def time_axis_advice(system: System, t: Any, state: Any, args: Any) -> str:
+    """What to say of a state whose leading axis seems to be one of times or of a batch; "" of others."""
+    shapes = [jnp.shape(x) for x in jax.tree.leaves(state)]
+    if not all(shapes) or len({s[0] for s in shapes}) != 1:
+        return ""
+    one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x)[1:], jnp.result_type(x)), state)
+    try:
+        _refuse(system, t, one, args)
+    except ValueError:
+        return ""
+    return LEADING_AXIS.format(shapes[0][0])
+
+
+def _refuse(system: System, t: Any, state: Any, args: Any) -> None:
+    if isinstance(system, ImplicitDAE):
+        found = returned("residual(t, y, yd, args)", system.residual, t, state, state, args)
+        return _as_many(found, "residual(t, y, yd, args)", state, "y")
+    if isinstance(system, SemiExplicitDAE):
+        x, z = state
+        _like(returned("f(t, x, z, args)", system.f, t, x, z, args), "f(t, x, z, args)", x, "x")
+        return _as_many(returned("g(t, x, z, args)", system.g, t, x, z, args), "g(t, x, z, args)", z, "z")
+    q, v = state
+    _like(returned("force(t, q, v, args)", system.force, t, q, v, args), "force(t, q, v, args)", q, "q")
+    if system.constraint is not None:
+        _is_vector(returned("constraint(t, q, args)", system.constraint, t, q, args), "constraint(t, q, args)")
+    if system.nonholonomic is not None:
+        call = "nonholonomic(t, q, v, args)"
+        _is_vector(returned(call, system.nonholonomic, t, q, v, args), call)
+    _check_mass(system, q, args)
+    return None
+
+
+def returned(call: str, function: Callable[..., Any], *values: Any) -> Any:
+    """The shapes that `function` returns for these arguments; `call` is how it is to be called, `force(t, q, v, args)`."""
+    refuse_other_arguments(call, function, len(values))
+    try:
+        return eqx.filter_eval_shape(function, *values)
+    except TRACED as error:
+        raise ValueError(
+            f"`{call}` must be traceable by JAX, but makes numbers of its arguments ({_first_line(error)}): use jax.numpy and "
+            "`jnp.where` in place of numpy, `math`, `float` and `if`."
+        ) from error
+    except Exception as error:
+        raise ValueError(
+            f"`{call}` fails with {', '.join(_named(call, values))}: {type(error).__name__}: {_first_line(error)}."
+        ) from error
+
+
+def refuse_other_arguments(call: str, function: Callable[..., Any], count: int, **keywords: Any) -> None:
+    """Refuses functions that cannot be called as `call` says, with `count` arguments and keyword arguments."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):
+        return
+    try:
+        signature.bind(*range(count), **keywords)
+    except TypeError:
+        raise ValueError(
+            f"`{call}` must take these arguments, but the function given takes {signature}: write `def {call}: ...`."
+        ) from None
+
+
+def _named(call: str, values: Any) -> list[str]:
+    names = call.partition("(")[2].rstrip(")").split(", ")
+    return [f"{name}: {describe(x)}" for name, x in zip(names, values, strict=False) if name != "t"]
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).strip().splitlines() or [""])[0].rstrip(".")
+
+
+def refuse_no_numbers(found: Any, call: str) -> None:
+    """Refuses results that are not real floating-point numbers; integers have no derivative, booleans neither."""
+    for leaf in jax.tree.leaves(found, is_leaf=lambda x: x is None):
+        if not isinstance(leaf, NUMBERS):
+            raise ValueError(f"`{call}` must return numbers, but returns {describe(found)}.")
+        dtype = jnp.result_type(leaf)
+        if not jnp.issubdtype(dtype, jnp.floating):
+            raise ValueError(
+                f"`{call}` must return real floating-point numbers, which have a derivative, but returns {describe(found)}."
+            )
+
+
+def refuse_no_real_number(found: Any, call: str) -> None:
+    """Refuses results that are not one real number."""
+    if not isinstance(found, NUMBERS) or jnp.shape(found) != () or np.dtype(jnp.result_type(found)).kind not in "fiu":
+        raise ValueError(f"`{call}` must return a real number, but returns {describe(found)}.")
+
+
+def _shapes(tree: Any) -> tuple[Any, list[Any]]:
+    leaves, structure = jax.tree.flatten(tree)
+    return structure, [jnp.shape(x) for x in leaves]
+
+
+def _count(tree: Any) -> int:
+    return sum(int(np.prod(jnp.shape(x))) for x in jax.tree.leaves(tree))
+
+
+def _like(found: Any, call: str, like: Any, name: str) -> None:
+    """The structure and the shapes of `like`; for one vector, as many numbers in any other form."""
+    # Numbers of other types are cast to those of the state.
+    for leaf in jax.tree.leaves(found, is_leaf=lambda x: x is None):
+        if not isinstance(leaf, NUMBERS) or jnp.issubdtype(jnp.result_type(leaf), jnp.complexfloating):
+            raise ValueError(
+                f"`{call}` must return real numbers in the structure of {name}, but returns {describe(found)}."
+            )
+    is_vector = isinstance(like, NUMBERS) and jnp.ndim(like) < 2
+    if _shapes(found) != _shapes(like) and not (is_vector and _count(found) == _count(like)):
+        raise ValueError(
+            f"`{call}` must return the structure of {name}, {describe(like)}, but returns {describe(found)}."
+        )
+
+
+def _as_many(found: Any, call: str, like: Any, name: str) -> None:
+    refuse_no_numbers(found, call)
+    if _count(found) != _count(like):
+        raise ValueError(
+            f"`{call}` must return as many equations as {name} has unknowns, {_count(like)}, but returns {_count(found)}: "
+            f"{describe(found)}."
+        )
+
+
+def _is_vector(found: Any, call: str) -> None:
+    if not isinstance(found, NUMBERS):
+        raise ValueError(
+            f"`{call}` must return a number or a vector, one entry a constraint, but returns {describe(found)}: put the "
+            "constraints together with `jnp.stack([...])`, or `jnp.concatenate` for vectors."
+        )
+    refuse_no_numbers(found, call)
+    if _count(found) == 0:
+        raise ValueError(
+            f"`{call}` must return at least one constraint, but returns {describe(found)}: without constraints it is an ODE, "
+            "which `diffrax.diffeqsolve` solves."
+        )
+
+
+def _check_mass(system: ConstrainedSystem, q: Any, args: Any) -> None:
+    mass, name = system.mass, "mass"
+    if callable(mass):
+        name = "mass(q, args)"
+        mass = returned(name, mass, q, args)
+    if mass is None:
+        return
+    n = _count(q)
+    is_array = isinstance(mass, NUMBERS) and jnp.shape(mass) in ((), (n,), (n, n))
+    is_structure = _shapes(mass) in (_shapes(q), _shapes([0.0] * n)) and _all_numbers(mass)
+    if not is_array and not is_structure:
+        raise ValueError(
+            f"`{name}` must be a vector of {n} masses, a ({n}, {n}) matrix, or have the structure of q, {describe(q)}, but is "
+            f"{describe(mass)}."
+        )
+
+
+def _all_numbers(tree: Any) -> bool:
+    return all(isinstance(x, NUMBERS) for x in jax.tree.leaves(tree, is_leaf=lambda x: x is None))
+
+
+def not_finite(system: System, t: Any, state: Any, args: Any) -> str:
+    """Which of a system's functions are not finite at a state, in a sentence with what may be the reason; "" if all are."""
+    calls: dict[str, tuple[Any, tuple[Any, ...]]] = {}
+    if isinstance(system, ConstrainedSystem):
+        q, v = state
+        mass = system.mass if callable(system.mass) else lambda q, args: system.mass
+        calls = {
+            "force(t, q, v, args)": (system.force, (t, q, v, args)),
+            "constraint(t, q, args)": (system.constraint, (t, q, args)),
+            "nonholonomic(t, q, v, args)": (system.nonholonomic, (t, q, v, args)),
+            "mass(q, args)" if callable(system.mass) else "mass": (mass, (q, args)),
+        }
+    elif isinstance(system, SemiExplicitDAE):
+        x, z = state
+        calls = {"f(t, x, z, args)": (system.f, (t, x, z, args)), "g(t, x, z, args)": (system.g, (t, x, z, args))}
+    else:
+        rates = jax.tree.map(jnp.zeros_like, state)
+        calls = {"residual(t, y, yd, args)": (system.residual, (t, state, rates, args))}
+    bad = [call for call, (function, values) in calls.items() if function and not _all_finite(function(*values))]
+    if not bad:
+        return ""
+    reason = "; `args` holds NaN or infinity" if not _all_finite(args) else ""
+    return f"`{'`, `'.join(bad)}` {'is' if len(bad) == 1 else 'are'} not finite at the start{reason}."
+
+
+def _all_finite(tree: Any) -> bool:
+    numbers = [x for x in jax.tree.leaves(tree) if isinstance(x, NUMBERS)]
+    return all(bool(jnp.all(jnp.isfinite(jnp.asarray(x)))) for x in numbers)
