@@ -169,18 +169,19 @@ def explain(
     """
     refuse_no_time("t0", t0)
     dt0 = None if isinstance(solver, diffrax.AbstractAdaptiveSolver) else 1e-3
-    inputs = prepared(
+    solve, problem = prepared(
         system, solver, t0, t0 + 1.0, dt0, y0, args, formulation, saveat, stepsize_controller, adjoint, event, 4096,
         progress_meter,
     )  # fmt: skip
-    inputs = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray | np.generic) else x, inputs)
-    solve, system, t0, _, _, y0, args = inputs
-    traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(inputs))
-    invertible = solve.formulation.inverts_mass
-    rank = getattr(system, "rank", None) if traced else refuse_bad_start(system, t0, y0, args, invertible)
-    solve.refuse_wrong_functions(*inputs[1:])
+    solve, problem = jax.tree.map(
+        lambda x: jnp.asarray(x) if isinstance(x, np.ndarray | np.generic) else x, (solve, problem)
+    )
+    system, t0, y0, args = problem.start
+    traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((solve, problem)))
+    rank = problem.rank if traced else refuse_bad_start(*problem.start, solve.formulation.inverts_mass)
+    solve.refuse_wrong_functions(problem)
     precision = precision_of(t0.dtype, solve.controller)
-    kernel, arrays = solve.kernel(*inputs[1:], rank)
+    kernel, arrays = solve.kernel(dataclasses.replace(problem, rank=rank))
     found = hindrances(jax.make_jaxpr(without_checks(kernel))(arrays))
     enabled = one_kernel_enabled() and jax.default_backend() == "cpu" and solve.derivative() != "any"
     reduced = isinstance(solve.formulation, ReducedResidual)

@@ -1,5 +1,6 @@
 """`daesolve`: one solve of a DAE, through `diffrax.diffeqsolve`."""
 
+import dataclasses
 import functools
 from typing import Any
 
@@ -10,10 +11,10 @@ import numpy as np
 
 from .driver.failures import OKAY, in_words, raised_in_the_program
 from .driver.options import refuse_misfits, refuse_no_event, refuse_other_steps, refuse_wrong_options, takes_residuals
-from .driver.program import Program, Solve, run, split
+from .driver.problem import Problem, Program, split
+from .driver.program import Solve, run
 from .driver.resets import Jump, refuse_other_outputs
 from .driver.start import as_array, checked, refuse_bad_start, refuse_bad_times
-from .equations.constraint_jacobian import Rank
 from .formulations import (
     AbstractFormulation,
     Differentiation,
@@ -29,7 +30,7 @@ from .validate.states import with_rates
 from .validate.user_functions import not_finite, refuse_wrong_functions
 
 
-_ranks: dict[Program, Rank | None] = {}
+_of_known_rank: dict[Program, Program] = {}
 
 
 def daesolve(
@@ -77,23 +78,23 @@ def daesolve(
     Errors: `ValueError` or `TypeError` in a sentence for wrong input that is concrete; `RuntimeError` where the solve
     fails, or a `RESULTS` code with `throw=False`.
     """
-    inputs = prepared(
+    solve, problem = prepared(
         with_rates(system, yd0, y0), solver, t0, t1, dt0, y0, args, formulation, saveat, stepsize_controller, adjoint, event,
         max_steps, progress_meter,
     )  # fmt: skip
-    program, arrays = split(inputs)
+    program, arrays = split((solve, problem))
     if any(isinstance(x, jax.core.Tracer) for x in arrays):
-        sol, *_ = run(program, getattr(system, "rank", None), arrays)
+        sol, *_ = run(program, arrays)
     else:
-        sol = _run_on_numbers(program, arrays, inputs)
-    return _raise_if_failed(sol, inputs) if throw else sol
+        sol = _run_on_numbers(program, arrays, solve, problem)
+    return _raise_if_failed(sol, problem) if throw else sol
 
 
 def prepared(
     system: Any, solver: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, formulation: Any, saveat: Any,
     stepsize_controller: Any, adjoint: Any, event: Any, max_steps: Any, progress_meter: Any,
-) -> tuple[Solve, Any, Any, Any, Any, Any, Any]:  # fmt: skip
-    """The method and (system, t0, t1, dt0, y0, args) of a solve, checked, with the defaults filled in."""
+) -> tuple[Solve, Problem]:  # fmt: skip
+    """The method and the problem of a solve, checked, with the defaults filled in."""
     y0, args = checked(system, t0, t1, dt0, y0, args)
     refuse_wrong_options(saveat, stepsize_controller, adjoint, event, max_steps, progress_meter)
     if formulation is None and takes_residuals(solver):
@@ -124,7 +125,7 @@ def prepared(
     if isinstance(event, Jump):
         refuse_other_outputs(saveat)
     solve = Solve(formulation, solver, saveat, stepsize_controller, adjoint, event, max_steps, progress_meter)
-    return solve, system, t0, t1, dt0, y0, args
+    return solve, Problem(system, t0, t1, dt0, y0, args, getattr(system, "rank", None))
 
 
 def _for_residuals(system: Any, t0: Any, y0: Any, args: Any, solver: Any) -> AbstractFormulation:
@@ -146,7 +147,7 @@ def _found_of_structure(program: Program, shapes: tuple[Any, ...], form: Any, hi
     found = []
 
     def look(arrays: Any) -> None:
-        inputs = program.inputs(arrays)
+        inputs = program.whole(arrays)
         refuse_wrong_functions(*inputs)
         found.append(why_not_as_written(*inputs, form, highest))
 
@@ -154,21 +155,21 @@ def _found_of_structure(program: Program, shapes: tuple[Any, ...], form: Any, hi
     return found[0]
 
 
-def _run_on_numbers(program: Program, arrays: list[Any], inputs: Any) -> DAESolution:
+def _run_on_numbers(program: Program, arrays: list[Any], solve: Solve, problem: Problem) -> DAESolution:
     """`run`, refusing an inconsistent start in words. How many constraints are independent is found, and remembered, where it
     is not all of them.
     """
-    solve, system, t0, t1, _, y0, args = inputs
-    refuse_bad_times(solve.saveat, t0, t1)
-    rank = _ranks.get(program, getattr(system, "rank", None))
-    sol, as_expected, seconds = run(program, rank, arrays)
+    refuse_bad_times(solve.saveat, problem.t0, problem.t1)
+    known = _of_known_rank.get(program, program)
+    sol, as_expected, seconds = run(known, arrays)
     # Inside an outer `jit` the result is no number, although the inputs are: they are looked at each time it is traced.
     inside = isinstance(as_expected, jax.core.Tracer)
     if inside or not as_expected:
         with jax.ensure_compile_time_eval():
-            _ranks[program] = refuse_bad_start(system, t0, y0, args, solve.formulation.inverts_mass)
-        if _ranks[program] != rank:
-            sol, _, more = run(program, _ranks[program], arrays)
+            rank = refuse_bad_start(*problem.start, solve.formulation.inverts_mass)
+        _of_known_rank[program], _ = split((solve, dataclasses.replace(problem, rank=rank)))
+        if _of_known_rank[program] != known:
+            sol, _, more = run(_of_known_rank[program], arrays)
             seconds += more
     if not inside:
         sol.stats["compile_seconds"] = seconds
@@ -184,10 +185,9 @@ def _default_controller(dt0: Any, dtype: Any) -> Any:
 _PID64, _PID32 = (diffrax.PIDController(rtol=tolerance, atol=tolerance) for tolerance in (1e-8, 1e-5))
 
 
-def _raise_if_failed(sol: DAESolution, inputs: Any) -> DAESolution:
+def _raise_if_failed(sol: DAESolution, problem: Problem) -> DAESolution:
     if isinstance(sol.result._value, jax.core.Tracer):
         return raised_in_the_program(sol)
     if int(sol.result._value) in OKAY:
         return sol
-    _, system, t0, _, _, y0, args = inputs
-    raise RuntimeError(" ".join([str(in_words(sol)), not_finite(system, t0, y0, args)]).strip())
+    raise RuntimeError(" ".join([str(in_words(sol)), not_finite(*problem.start)]).strip())

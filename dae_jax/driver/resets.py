@@ -20,6 +20,7 @@ from ..solution import RESULTS, DAESolution, precision_of
 from ..systems import System
 from ..validate.states import NUMBERS, brief, broadcast_to_state, describe
 from ..validate.user_functions import refuse_other_arguments, returned
+from .problem import Problem
 from .start import saved_parts
 
 
@@ -139,10 +140,10 @@ class _Progress(NamedTuple):
     level: Float[Array, ""]
 
 
-def solve_with_jumps(
-    solve: Any, system: System, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, rank: int | None
-) -> tuple[DAESolution, Any]:
+def solve_with_jumps(solve: Any, problem: Problem) -> tuple[DAESolution, Any]:
     """What `solve` gives, part by part; `solve.event` is a `Jump`."""
+    system, t0, y0, args = problem.start
+    t1, rank = problem.t1, problem.rank
     jump, (output,) = solve.event, saved_parts(solve.saveat)
     empty = jnp.zeros(0, t0.dtype)
     wanted = jnp.concatenate(
@@ -164,7 +165,7 @@ def solve_with_jumps(
         later = sign * jnp.maximum(sign * wanted, sign * p.t)
         subs = {"wanted": dataclasses.replace(output, t0=False, t1=False, ts=later), "end": diffrax.SubSaveAt(t1=True)}
         one = dataclasses.replace(solve, event=event, saveat=diffrax.SaveAt(subs=subs))
-        return *one(system, p.t, t1, dt0, p.y, p.args, rank), level
+        return *one(dataclasses.replace(problem, t0=p.t, y0=p.y, args=p.args)), level
 
     def advance(p: _Progress) -> _Progress:
         sol, _, level = part(p)

@@ -162,11 +162,11 @@ def test_inside_jit_there_is_no_time_to_tell():
 def test_dummy_derivatives_of_a_mechanism_are_not_left_to_xla():
     """The double pendulum: estimated at more than is allowed, half of it zeros, with factorials in it."""
     scene = scenes.double_pendulum()
-    solve, *inputs = prepared(
+    solve, problem = prepared(
         scene.system, diffrax.Tsit5(), 0.0, 1.0, None, scene.y0, None, dae_jax.DummyDerivatives(),
         diffrax.SaveAt(t1=True), None, diffrax.RecursiveCheckpointAdjoint(), None, 4096, diffrax.NoProgressMeter(),
     )  # fmt: skip
-    kernel, arrays = solve.kernel(*inputs, None)
+    kernel, arrays = solve.kernel(problem)
     jaxpr = jax.make_jaxpr(without_checks(kernel))(arrays)
     assert extent(jaxpr, [v.aval.size > SMALL for v in jaxpr.jaxpr.invars])[0] > compiler.LIMIT
     assert hindrances(jaxpr) == ()

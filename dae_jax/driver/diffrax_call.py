@@ -1,0 +1,167 @@
+"""A solve as a call of `diffrax.diffeqsolve`, which sees the solver's state where the user sees his own."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, cast
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix
+
+from ..formulations import AbstractFormulation, Residual
+from ..linalg import rms_norm
+from ..solution import RESULTS, Interpolation
+from ..solvers import (
+    BDF,
+    DOP853,
+    AbstractManifoldSolver,
+    AbstractResidualSolver,
+    OrthogonalProjection,
+    RadauIIA5,
+    SelectedResiduals,
+    SelectedStates,
+    TangentSpace,
+    WithoutFailedSteps,
+    first_step,
+    unrolled,
+)
+from ..solvers.tangent_space import TangentPoint
+from .problem import Problem
+from .start import is_saved_part
+from .trajectory_adjoint import as_it_is, can_be_taped
+
+
+class Decode(eqx.Module):
+    """The user's view of a point of the solver's dense output."""
+
+    formulation: AbstractFormulation
+    solver: diffrax.AbstractSolver
+
+    def __call__(self, t: Any, y: Any, ode: Any) -> Any:
+        if isinstance(self.solver, AbstractManifoldSolver):
+            y = self.solver.land(t, y, ode)
+        return self.formulation.decode(t, y, ode)
+
+
+class View(eqx.Module):
+    """What is saved of a point of the solver's dense output."""
+
+    fn: Callable[..., Any]
+    decode: Decode
+    args: Any
+
+    def __call__(self, t: Any, y: Any, ode: Any) -> Any:
+        return self.fn(t, self.decode(t, y, ode), self.args)
+
+
+def call(solve: Any, problem: Problem) -> tuple[Any, ...]:
+    """`diffrax.diffeqsolve` on what the formulation makes of the problem; the fields of its solution, and the end."""
+    t0, t1, dt0, args = problem.t0, problem.t1, problem.dt0, problem.args
+    y, ode = solve.formulation.encode(*problem.start, problem.rank)
+    decode = Decode(solve.formulation, solve.solver)
+    solver, controller = economical(solve.solver, solve.between()), _fitted(solve.controller, t0, t1)
+    if isinstance(solve.formulation, Residual):
+        solver, controller = _of_residuals(solver, controller)
+        dt0 = first_step(ode.start, solver, t0, t1, y) if dt0 is None else dt0
+
+    def saved(part: Any) -> Any:
+        return part if part.fn is as_it_is else eqx.tree_at(lambda s: s.fn, part, View(part.fn, decode, args))
+
+    subs = {
+        "user": jax.tree.map(saved, solve.saveat.subs, is_leaf=is_saved_part),
+        "end": diffrax.SubSaveAt(t1=True, fn=decode),
+    }
+    saveat = eqx.tree_at(lambda s: s.subs, solve.saveat, subs, is_leaf=lambda x: x is None)
+    event = solve.event and dataclasses.replace(
+        solve.event,
+        cond_fn=jax.tree.map(
+            lambda c, up: _on_states(c, decode, args, up),
+            solve.event.cond_fn,
+            solve.event.direction,
+            is_leaf=lambda x: x is None or callable(x),
+        ),
+    )
+    selects = isinstance(solver, SelectedStates | SelectedResiduals)
+    saveat = dataclasses.replace(saveat, solver_state=True) if selects else saveat
+    sol = diffrax.diffeqsolve(
+        solve.formulation.term(),
+        _for_derivative(solve, solver, y),
+        t0, t1, dt0, y,
+        args=ode, saveat=saveat, stepsize_controller=controller, adjoint=solve.adjoint, event=event,
+        max_steps=solve.max_steps, throw=False, progress_meter=solve.progress_meter,
+    )  # fmt: skip
+    interpolation = None
+    if sol.interpolation is not None:
+        interpolation = Interpolation(_uniform(solve.solver, sol.interpolation), decode, ode)
+    ts, ys = cast(Any, sol.ts), cast(Any, sol.ys)
+    end = jax.lax.stop_gradient(jax.tree.map(lambda x: x[-1], (ts["end"], ys["end"])))
+    stats = {**sol.stats, "end_time": end[0]}
+    starts = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(y)]))
+    result = RESULTS.where(starts, RESULTS.promote(sol.result), RESULTS.no_finite_start)
+    if selects:
+        stats["switches"] = cast(Any, sol.solver_state).switches
+    return sol.t0, sol.t1, ts["user"], ys["user"], interpolation, stats, result, sol.event_mask, end
+
+
+def _for_derivative(solve: Any, solver: Any, y: Any) -> Any:
+    """The solver as diffrax's reverse derivative needs it; the tape knows accepted steps only."""
+    size = sum(leaf.size for leaf in jax.tree.leaves(y))
+    ours = isinstance(solver, AbstractManifoldSolver | AbstractResidualSolver) and not hasattr(
+        solver, "root_finder"
+    )
+    by_diffrax = solve.derivative() == "reverse" and not can_be_taped(solve, size)
+    return WithoutFailedSteps(solver) if ours and by_diffrax else solver
+
+
+def _fitted(controller: Any, t0: Any, t1: Any) -> Any:
+    """The controller with a smallest step at the resolution of time, below which a solve cannot get on, and its default
+    norm without a library call.
+    """
+    if type(controller) is not diffrax.PIDController:
+        return controller
+    if controller.norm is optimistix.rms_norm:
+        controller = dataclasses.replace(controller, norm=rms_norm)
+    if controller.dtmin is not None:
+        return controller
+    floor = 16 * jnp.finfo(jnp.result_type(t0)).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+    return dataclasses.replace(controller, dtmin=floor, force_dtmin=False)
+
+
+def _of_residuals(solver: Any, controller: Any) -> tuple[Any, Any]:
+    """A solver with the controller's tolerances; it finds by itself where time resolves no smaller step."""
+    if not isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
+        return solver, controller
+    rtol, atol = (getattr(solver, name) or getattr(controller, name) for name in ("rtol", "atol"))
+    if type(controller) is diffrax.PIDController:
+        controller = dataclasses.replace(controller, dtmin=None)
+    return dataclasses.replace(solver, rtol=rtol, atol=atol), controller
+
+
+def _uniform(solver: Any, path: diffrax.DenseInterpolation) -> diffrax.DenseInterpolation:
+    """The dense output with one type of point, also for an interval of length 0."""
+    if not isinstance(solver, TangentSpace):
+        return path
+    first = TangentPoint(path.y0_if_trivial, jax.tree.map(lambda x: x[0], path.infos["normals"]))
+    return eqx.tree_at(lambda p: p.y0_if_trivial, path, first)
+
+
+def _on_states(cond: Callable[..., Any], decode: Any, args: Any, up: bool | None) -> Callable[..., Any]:
+    user_args = args
+
+    def condition(t: Any, y: Any, args: Any, **kwargs: Any) -> Any:
+        value = cond(t, decode(t, y, args), user_args, **kwargs)
+        # NaN crosses in no direction: it ends the solve here, which then says so.
+        return value if up is None else jnp.where(jnp.isnan(value), 1 if up else -1, value)
+
+    return condition
+
+
+def economical(solver: Any, between: bool) -> Any:
+    """The solver without what this solve does not need, with its stages written out."""
+    if isinstance(solver, OrthogonalProjection | TangentSpace | SelectedResiduals):
+        return dataclasses.replace(solver, solver=economical(solver.solver, between))
+    if isinstance(solver, BDF | DOP853 | RadauIIA5):
+        return dataclasses.replace(solver, dense=between)
+    return unrolled(solver)

@@ -1,0 +1,48 @@
+"""How a solve ended: one code for what diffrax says, what its start and end show, and what is not finite."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from ..formulations import Residual
+from ..solution import RESULTS, DAESolution, all_finite, precision_of
+from .problem import Problem
+from .start import is_saved_part
+
+
+def judged(solve: Any, out: Any, problem: Problem, found: Any) -> DAESolution:
+    """The solution, with the code of what is wrong with it; `found`: what a look at its start and its end has shown."""
+    *fields, code, event_mask = out
+    (start, _), end, (finite_end, defined) = found
+    _, _, ts, ys, *_ = fields
+    failed = lambda name, instead, when=True: RESULTS.where((code == name) & when, instead, code)
+    if isinstance(solve.formulation, Residual):
+        code = failed(RESULTS.dt_min_reached, RESULTS.error_too_large)
+        code = failed(RESULTS.nonlinear_divergence, RESULTS.no_convergence)
+        code = failed(RESULTS.singular, RESULTS.singular_iteration_matrix)
+    code = failed(RESULTS.dt_min_reached, RESULTS.step_rejected)
+    code = failed(RESULTS.nonlinear_divergence, RESULTS.off_manifold)
+    finite = [all_finite(*pair) for pair in _saved(solve.saveat, ts, ys)] if ts is not None else []
+    precision = precision_of(fields[0].dtype, solve.controller)
+    went_well = (code == RESULTS.successful) | (code == RESULTS.event_occurred)
+    code = RESULTS.where(went_well & ~jnp.all(jnp.stack([finite_end, *finite])), RESULTS.not_finite, code)
+    went_well = (code == RESULTS.successful) | (code == RESULTS.event_occurred)
+    code = RESULTS.where(went_well & ~defined, RESULTS.undefined_condition, code)
+    stuck = [RESULTS.step_rejected, RESULTS.off_manifold, RESULTS.no_convergence, RESULTS.error_too_large]
+    stuck = jnp.any(jnp.stack([code == name for name in (*stuck, RESULTS.singular_iteration_matrix)]))
+    code = RESULTS.where(stuck & end.singular, RESULTS.singular_configuration, code)
+    code = RESULTS.where(went_well & ~end.near, RESULTS.off_constraints, code)
+    code = RESULTS.where(end.masses & (end.masses_ahead | went_well), code, RESULTS.irregular_mass)
+    for wrong, name in enumerate(("inconsistent_start", "dependent_constraints", "irregular_mass", "ambiguous_start"), 1):
+        code = RESULTS.where(start == wrong, getattr(RESULTS, name), code)
+    rank = problem.rank[1] if isinstance(problem.rank, tuple) else problem.rank
+    return DAESolution(*fields, code, event_mask, problem.args, rank, precision)
+
+
+def _saved(saveat: Any, ts: Any, ys: Any) -> list[tuple[Any, Any]]:
+    """The (times, states) of each part of `saveat`."""
+    structure = jax.tree.structure(saveat.subs, is_leaf=is_saved_part)
+    return [
+        (t, y) for t, y in zip(structure.flatten_up_to(ts), structure.flatten_up_to(ys), strict=True) if t is not None
+    ]

@@ -1,0 +1,69 @@
+"""What is solved, and how a pytree is taken apart into its arrays and the rest, which is known while tracing."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from ..compiler import one_kernel_enabled
+from ..equations.constraint_jacobian import Rank
+
+
+class Problem(eqx.Module):
+    """All of a solve but its method: a system from `t0` to `t1`, its start, and how many of its constraints are
+    independent there (`None`: all).
+    """
+
+    system: Any
+    t0: Any
+    t1: Any
+    dt0: Any
+    y0: Any
+    args: Any
+    rank: int | Rank | None = eqx.field(static=True)
+
+    @property
+    def start(self) -> tuple[Any, Any, Any, Any]:
+        """(system, t0, y0, args)."""
+        return self.system, self.t0, self.y0, self.args
+
+
+class Program(NamedTuple):
+    """All of a pytree but its arrays: hashable, and different for 1 and 1.0."""
+
+    treedef: Any
+    leaves: tuple[Any, ...]
+    types: tuple[type, ...]
+    one_kernel: bool
+
+    def whole(self, arrays: list[Any]) -> Any:
+        """The pytree with these arrays."""
+        rest = iter(arrays)
+        return jax.tree.unflatten(self.treedef, [next(rest) if x is _ARRAY else x for x in self.leaves])
+
+
+_ARRAY = object()
+
+
+def split(tree: Any) -> tuple[Program, list[Any]]:
+    """What a solve is given, as a program and its arrays."""
+    leaves, treedef = jax.tree.flatten(tree)
+    arrays = [x for x in leaves if isinstance(x, jax.Array | np.ndarray | np.generic)]
+    static = tuple(_ARRAY if isinstance(x, jax.Array | np.ndarray | np.generic) else x for x in leaves)
+    return Program(treedef, static, tuple(map(type, static)), one_kernel_enabled()), arrays
+
+
+class Split(eqx.Module):
+    """What a jitted function returns: its arrays, and the rest."""
+
+    numbers: Any
+    rest: Any = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, tree: Any) -> "Split":
+        return cls(*eqx.partition(tree, eqx.is_array))
+
+    def whole(self) -> Any:
+        """The two together."""
+        return eqx.combine(self.numbers, self.rest)
