@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .equations.constraint_jacobian import Rank, mass_solve
-from .equations.constraints import MechanicalODE
 from .equations.initial_rates import is_nonlinear, rates_of
 from .equations.linearised import Pencil
+from .equations.mechanical import MechanicalODE
 from .equations.regularity import has_rank, is_near_constraints, mass_is_regular, weakest
 from .equations.residual_form import ResidualForm
 from .equations.structural_ode import StructuralODE

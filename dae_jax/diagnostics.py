@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .equations.constraints import MechanicalODE
+from .equations.mechanical import MechanicalODE
 from .equations.residual_drift import EquationDrift, equation_drift
 from .solution import DAESolution, without_padding
 from .systems import ConstrainedSystem, System

@@ -13,8 +13,8 @@ from .compiler import equations, hindrances, one_kernel_enabled, without_checks
 from .driver.program import Solve
 from .driver.start import refuse_bad_start, refuse_no_time
 from .equations.constraint_jacobian import SparseNormals
-from .equations.constraints import MechanicalODE
 from .equations.linearised import Pencil
+from .equations.mechanical import MechanicalODE
 from .equations.residual_form import ResidualForm
 from .equations.structural_ode import StructuralODE
 from .formulations import AbstractFormulation, DummyDerivatives, ReducedResidual, Residual

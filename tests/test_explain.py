@@ -114,7 +114,7 @@ def test_sparse_and_dense_give_the_same_numbers(make, monkeypatch):
         scene.system, PROJECTED, 0.0, 0.5, None, scene.y0, formulation=dae_jax.Baumgarte(1.0, 2.0)
     )
     sparse = solve()
-    monkeypatch.setattr("dae_jax.equations.constraints.SPARSE_FROM", 1000)
+    monkeypatch.setattr("dae_jax.equations.mechanical.SPARSE_FROM", 1000)
     system = dae_jax.ConstrainedSystem(lambda *a: scene.system.force(*a), scene.system.constraint)
     dense = dae_jax.daesolve(system, PROJECTED, 0.0, 0.5, None, scene.y0, formulation=dae_jax.Baumgarte(1.0, 2.0))
     for a, b in zip(sparse.ys, dense.ys, strict=True):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import dae_jax
-from dae_jax.equations.constraints import MechanicalODE
+from dae_jax.equations.mechanical import MechanicalODE
 from dae_jax.scenes import double_pendulum, knife_edge, moving_pivot_pendulum, pendulum
 
 

@@ -8,7 +8,7 @@ import pytest
 
 import dae_jax
 from dae_jax import RESULTS, ConstrainedSystem
-from dae_jax.equations.constraints import MechanicalODE
+from dae_jax.equations.mechanical import MechanicalODE
 from dae_jax.equations.regularity import is_near_constraints
 from dae_jax.scenes import SCENES
 

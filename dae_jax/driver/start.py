@@ -10,7 +10,7 @@ import numpy as np
 
 from ..consistent import unsolved, violation
 from ..equations.constraint_jacobian import Rank
-from ..equations.constraints import MechanicalODE
+from ..equations.mechanical import MechanicalODE
 from ..equations.regularity import mass_is_regular, mass_message, rank_message, rank_of, redundancy
 from ..solution import RESULTS
 from ..systems import ConstrainedSystem, ImplicitDAE

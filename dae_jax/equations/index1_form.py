@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..linalg import take
 from ..structure import dependence
-from .constraints import at_one_instant
+from .manifold_ode import at_one_instant
 from .structural_ode import StructuralODE
 
 

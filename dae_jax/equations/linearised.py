@@ -22,10 +22,10 @@ from ..structure import (
     signature,
 )
 from ..systems import ConstrainedSystem
-from .constraints import at_one_instant
 from .derivative_orders import Combination, Offsets, find_offsets
 from .index1_form import ReducedForm
 from .initial_rates import is_nonlinear, rates_of
+from .manifold_ode import at_one_instant
 from .residual_form import ResidualForm
 
 

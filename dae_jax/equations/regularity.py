@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..linalg import smallest_pivot
 from .constraint_jacobian import Rank, SparseNormals, matvec
-from .constraints import MechanicalODE, allowed_contradiction
+from .mechanical import MechanicalODE, allowed_contradiction
 
 
 # A drift that counts as large as the solution itself, as a part of this: the distance to |q| = 1 is nowhere more than |q|/2.

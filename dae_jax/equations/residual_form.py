@@ -12,7 +12,8 @@ from jaxtyping import Array, Bool, Float
 from ..linalg import row_products, solve
 from ..structure.layout import Layout
 from ..systems import ConstrainedSystem, ImplicitDAE, SemiExplicitDAE, System
-from .constraints import MechanicalODE, at_one_instant
+from .manifold_ode import at_one_instant
+from .mechanical import MechanicalODE
 
 
 # Up to this many unknowns multipliers are found without M⁻¹, where coordinates may be massless.

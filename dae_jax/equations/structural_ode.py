@@ -24,9 +24,10 @@ from ..linalg import (
 )
 from ..structure import interpreted
 from ..systems import ConstrainedSystem
-from .constraints import ManifoldODE, MechanicalODE, at_one_instant
 from .derivative_orders import Combination, derivative_of, find_offsets
 from .initial_rates import is_nonlinear, rates_of
+from .manifold_ode import ManifoldODE, at_one_instant
+from .mechanical import MechanicalODE
 from .residual_form import ResidualForm
 from .taylor import total_derivatives
 

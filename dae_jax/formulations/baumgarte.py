@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ..equations.constraints import ManifoldODE
+from ..equations.manifold_ode import ManifoldODE
 from ..equations.structural_ode import underlying_ode
 from .differentiation import AbstractFormulation
 

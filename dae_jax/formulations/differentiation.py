@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import diffrax
 import equinox as eqx
 
-from ..equations.constraints import ManifoldODE
+from ..equations.manifold_ode import ManifoldODE
 from ..equations.structural_ode import underlying_ode
 
 

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..equations.constraints import MechanicalODE, at_one_instant
+from ..equations.manifold_ode import at_one_instant
+from ..equations.mechanical import MechanicalODE
 from ..linalg import newton, semidefinite_solve
 from ..validate.states import NUMBERS
 from .differentiation import AbstractFormulation

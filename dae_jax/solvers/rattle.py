@@ -5,7 +5,7 @@ from typing import Any
 import diffrax
 import jax.numpy as jnp
 
-from ..equations.constraints import mass_solve
+from ..equations.constraint_jacobian import mass_solve
 from .implicit import hermite
 from .manifold import AbstractManifoldSolver, clock, or_nan, outcome
 

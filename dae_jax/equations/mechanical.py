@@ -1,10 +1,5 @@
-"""The mathematics of a system at one instant: its underlying ODE and the manifold that this lives on.
+"""The underlying ODE of a mechanism with constraints, and the manifold that it lives on."""
 
-Differentiating a DAE often enough gives an underlying ODE ẏ = field(t, y) and the invariants H(t, y) = 0, the constraints
-and their hidden derivatives. Formulations and solvers see a system through this interface alone.
-"""
-
-import abc
 import dataclasses
 import functools
 from collections.abc import Callable
@@ -16,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..compiler import scalarise, subroutine
 from ..linalg import fixed_point, implicit_root, relative_change, solve
 from ..structure.layout import Layout
 from ..systems import ConstrainedSystem
@@ -31,71 +25,12 @@ from .constraint_jacobian import (
     sparse_normals,
     unit_diagonal,
 )
+from .manifold_ode import ManifoldODE, at_one_instant
 
 
 def allowed_contradiction(dtype: Any) -> float:
     """The part of the accelerations that dependent constraints ask for in which they may disagree."""
     return max(1e-6, float(jnp.finfo(dtype).eps) ** 0.5)
-
-
-def at_one_instant(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Runs a method of an `eqx.Module` as scalar arithmetic where it is small, traced once for all its call sites."""
-
-    @functools.wraps(method)
-    def wrapped(*args: Any) -> Any:
-        arrays, static = eqx.partition(args, eqx.is_array)
-        leaves, treedef = jax.tree.flatten(static)
-        return _evaluate(method, tuple(leaves), treedef, arrays)
-
-    return wrapped
-
-
-@functools.partial(subroutine, static_argnums=(0, 1, 2))
-def _evaluate(method: Callable[..., Any], leaves: tuple[Any, ...], treedef: Any, arrays: Any) -> Any:
-    static = jax.tree.unflatten(treedef, leaves)
-    return scalarise(lambda arrays: method(*eqx.combine(arrays, static)))(arrays)
-
-
-class ManifoldODE(eqx.Module):
-    """An ODE ẏ = field(t, y) with invariants H(t, y) = 0: what a formulation makes of a DAE.
-
-    It travels through `diffrax.diffeqsolve` as `args`, so that its arrays can be batched over and differentiated. `y` is
-    a pytree of flat vectors.
-    """
-
-    @abc.abstractmethod
-    def field(self, t: Any, y: Any, feedback: Any = None) -> Any:
-        """The underlying ODE at (t, y). `feedback`, a function of H and its derivatives level by level, is added to the
-        highest derivative of each constraint, which is 0 otherwise (see `Baumgarte`).
-        """
-
-    @abc.abstractmethod
-    def invariants(self, t: Any, y: Any) -> tuple[Float[Array, " levels"], ...]:
-        """H(t, y), level by level: the constraints, then their hidden derivatives."""
-
-    @abc.abstractmethod
-    def normals(self, t: Any, y: Any) -> Any:
-        """Directions that span a complement of the manifold's tangent space at (t, y), and what is needed to use them."""
-
-    @abc.abstractmethod
-    def shift(self, y: Any, normals: Any, mu: Any) -> Any:
-        """y + N μ, with the normals N and a flat vector μ."""
-
-    @abc.abstractmethod
-    def restore(self, t: Any, y: Any, normals: Any) -> tuple[Any, Bool[Array, ""]]:
-        """The point y + N μ on the manifold at time t, and whether it was found."""
-
-    def project(self, t: Any, y: Any) -> tuple[Any, Bool[Array, ""]]:
-        """The nearest point on the manifold at time t, with the normals at y itself, and whether it was found."""
-        return self.restore(t, y, self.normals(t, y))
-
-    @abc.abstractmethod
-    def tangent(self, dy: Any, normals: Any) -> Any:
-        """The part of a derivative ẏ in the tangent space to which `normals` are normal."""
-
-    @abc.abstractmethod
-    def decode(self, t: Any, y: Any) -> Any:
-        """The state in the user's structure."""
 
 
 class MechanicalODE(ManifoldODE):
