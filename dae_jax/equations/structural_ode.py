@@ -331,7 +331,7 @@ def _nearest(ode: StructuralODE, t: Any, known: Any, weights: Any) -> Any:
         cut = 100 * jnp.finfo(y.dtype).eps * jnp.maximum(jnp.trace(gram), 1)
         return start - weights**2 * jnp.sum(a * solve(gram + cut * jnp.eye(len(h), dtype=y.dtype), off)[:, None], 0)
 
-    def materialised(params: Any, y: Any, towards: Any) -> Any:
+    def settled(params: Any, y: Any, towards: Any) -> Any:
         def correct(y: Any) -> Any:
             new = moved(y, towards(y), params)
             return new, relative_change(new - y, y)
@@ -346,10 +346,10 @@ def _nearest(ode: StructuralODE, t: Any, known: Any, weights: Any) -> Any:
 
     def iterate(params: Any) -> Any:
         # The nearest point, then what `cut` has left of H there.
-        near, _ = materialised(params, params[4], lambda y: aim(y, params))
-        return materialised(params, near, lambda y: y)
+        near, _ = settled(params, params[4], lambda y: aim(y, params))
+        return settled(params, near, lambda y: y)
 
-    first, _ = materialised((ode, t, known, weights), known, lambda y: jnp.where(is_value, known, y))
+    first, _ = settled((ode, t, known, weights), known, lambda y: jnp.where(is_value, known, y))
     params = (ode, t, known, weights, lax.stop_gradient(first))
     return implicit_root(lambda y, p: y - moved(y, aim(y, p), p), iterate, params)[0]
 

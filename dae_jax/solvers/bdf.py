@@ -311,9 +311,9 @@ def _decision(
     falls = falls & (k <= state.used) & (~state.rising | (here > SIGNIFICANT))
     falls = falls & (~held | (method.tail * change >= 1))
     rising = state.rising & ~falls & (k < MAX_ORDER)
-    materialised = ~rising & (alike > k + 1) & (k - state.used != 1) & (k < MAX_ORDER)
-    falls = falls | (materialised & (k > 1) & (low <= jnp.minimum(here, high)))
-    rises = (materialised & ~falls & (high < jnp.where(k == 1, here / 2, here))) | (rising & (state.steps > 0))
+    settled = ~rising & (alike > k + 1) & (k - state.used != 1) & (k < MAX_ORDER)
+    falls = falls | (settled & (k > 1) & (low <= jnp.minimum(here, high)))
+    rises = (settled & ~falls & (high < jnp.where(k == 1, here / 2, here))) | (rising & (state.steps > 0))
     order = k + rises - falls
     accepted = method.tail * change < 1
     expected = jnp.where(accepted, _at(list(errors), order - k + 1), errors[1])

@@ -42,8 +42,8 @@ class RATTLE(AbstractManifoldSolver):
         half = (q1 - q0) / h
         free = half + h / 2 * _free(args, t1_, q1, half)
         # q₁ is on the manifold; what is restored is the velocity.
-        (_, v1), materialised = args.restore(t1_, (q1, free), args.normals(t1_, (q1, free)))
-        found = found & materialised
+        (_, v1), settled = args.restore(t1_, (q1, free), args.normals(t1_, (q1, free)))
+        found = found & settled
         y1 = or_nan(found, (q1, v1))
         return y1, None, hermite(terms, args, t0, t1, y0, y1), None, outcome(jnp.asarray(found))
 

@@ -29,14 +29,14 @@ def elementwise(eqn: Any, inputs: list[Cells]) -> list[Cells]:
     A product with a known 0 is 0, also where the other factor may be infinite.
     """
     aval = eqn.outvars[0].aval
-    materialised = np.broadcast_to(_settled(eqn, inputs), aval.shape)
+    settled = np.broadcast_to(_settled(eqn, inputs), aval.shape)
     known, dependence = inputs[0].known, inputs[0].dependence
     for cells in inputs[1:]:
         known, dependence = known & cells.known, dependence | cells.dependence
-    known = known | materialised
+    known = known | settled
     if not known.any():
         return [Cells.unknown(dependence, aval)]
-    return [Cells(unless(known, dependence), known, _values(eqn, inputs, materialised))]
+    return [Cells(unless(known, dependence), known, _values(eqn, inputs, settled))]
 
 
 def _settled(eqn: Any, inputs: list[Cells]) -> Any:
@@ -57,7 +57,7 @@ def _settled(eqn: Any, inputs: list[Cells]) -> Any:
     return False
 
 
-def _values(eqn: Any, inputs: list[Cells], materialised: np.ndarray) -> np.ndarray:
+def _values(eqn: Any, inputs: list[Cells], settled: np.ndarray) -> np.ndarray:
     """The numbers of the known entries; the others are arbitrary."""
     name, aval = eqn.primitive.name, eqn.outvars[0].aval
     values = [np.broadcast_to(cells.value, aval.shape) for cells in inputs]
@@ -70,9 +70,9 @@ def _values(eqn: Any, inputs: list[Cells], materialised: np.ndarray) -> np.ndarr
             result = on_numbers(eqn, values)
             result = np.asarray(evaluate(eqn, values)[0]) if result is None else result
     result = np.broadcast_to(result, aval.shape)
-    if not materialised.any():
+    if not settled.any():
         return result
-    return np.where(materialised, np.asarray({"mul": 0, "and": 0, "div": 0}.get(name, 1), aval.dtype), result)
+    return np.where(settled, np.asarray({"mul": 0, "and": 0, "div": 0}.get(name, 1), aval.dtype), result)
 
 
 def select_n(eqn: Any, inputs: list[Cells]) -> list[Cells]:

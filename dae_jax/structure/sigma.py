@@ -68,26 +68,26 @@ def highest_value_transversal(signature: Sequence[Mapping[int, int]]) -> list[in
     for start in range(n):
         distance: dict[int, int] = {}
         reached_from: dict[int, int] = {}
-        materialised: dict[int, int] = {}
+        settled: dict[int, int] = {}
         heap: list[tuple[int, bool, int]] = []
         equation, travelled = start, 0
         while True:
             for variable, order in signature[equation].items():
-                if variable in materialised:
+                if variable in settled:
                     continue
                 new = travelled + u[equation] + v[variable] - order
                 if new < distance.get(variable, new + 1):
                     distance[variable], reached_from[variable] = new, equation
                     heapq.heappush(heap, (new, equation_of[variable] != -1, variable))
             travelled, _, variable = heapq.heappop(heap)
-            while variable in materialised:
+            while variable in settled:
                 travelled, _, variable = heapq.heappop(heap)
-            materialised[variable] = travelled
+            settled[variable] = travelled
             equation = equation_of[variable]
             if equation == -1:
                 break
         u[start] -= travelled
-        for other, reached_at in materialised.items():
+        for other, reached_at in settled.items():
             v[other] += travelled - reached_at
             if other != variable:
                 u[equation_of[other]] -= travelled - reached_at

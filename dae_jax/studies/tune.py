@@ -157,14 +157,14 @@ def descent(
             best = float(jnp.min(point.best))
             if not np.isfinite(best):
                 raise ValueError(f"`loss` or its gradient is not finite at any of the first {BLOCK} points.")
-            materialised = int(jnp.min(point.stale)) >= patience
-            shown.total = min(done + BLOCK, steps) if materialised else steps
-            shown.show(min(done + BLOCK, steps), f"best {best:.6g}{materialised * ', materialised'}")
+            settled = int(jnp.min(point.stale)) >= patience
+            shown.total = min(done + BLOCK, steps) if settled else steps
+            shown.show(min(done + BLOCK, steps), f"best {best:.6g}{settled * ', settled'}")
             history = History(*jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x, axis=1)), *records))
             winner = int(jnp.argmin(point.best))
             found = jax.tree.map(jnp.asarray, point_at(point.best_z[winner]))
             yield Tuned(found, point.best[winner], history, history.loss.size * cost)
-            if materialised:
+            if settled:
                 return
 
 
