@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .driver.failures import OKAY, in_words, raised_in_the_program
-from .driver.options import refuse_misfits, refuse_no_event, refuse_other_steps, refuse_wrong_options, takes_residuals
+from .driver.options import refuse_misfits, refuse_no_event, refuse_other_steps, refuse_wrong_options
 from .driver.problem import Problem, Program, split
 from .driver.program import Solve, run
 from .driver.resets import Jump, refuse_other_outputs
@@ -24,7 +24,7 @@ from .formulations import (
     why_not_as_written,
 )
 from .solution import DAESolution
-from .solvers import SelectedResiduals, SelectedStates
+from .solvers import SelectedResiduals, SelectedStates, takes_residuals
 from .systems import ConstrainedSystem, System
 from .validate.states import with_rates
 from .validate.user_functions import not_finite, refuse_wrong_functions
@@ -111,9 +111,9 @@ def prepared(
                 "`formulation=dae_jax.DummyDerivatives()` (or none), or a solver of the underlying ODE such as "
                 "OrthogonalProjection(DOP853())."
             )
-    if isinstance(formulation, DummyDerivatives) and takes_residuals(solver):
+    if formulation.selects_states and takes_residuals(solver):
         formulation, solver = ReducedResidual(), SelectedResiduals(solver.rtol, solver.atol, solver=solver)
-    elif isinstance(formulation, DummyDerivatives):
+    elif formulation.selects_states:
         solver = SelectedStates(solver)
     dtype = jnp.result_type(*jax.tree.leaves(y0))
     if stepsize_controller is None:

@@ -10,24 +10,17 @@ import jax
 import jax.numpy as jnp
 import optimistix
 
-from ..formulations import AbstractFormulation, Residual
+from ..formulations import AbstractFormulation
 from ..linalg import rms_norm
 from ..solution import RESULTS, Interpolation
 from ..solvers import (
-    BDF,
-    DOP853,
     AbstractManifoldSolver,
-    AbstractResidualSolver,
-    OrthogonalProjection,
-    RadauIIA5,
-    SelectedResiduals,
-    SelectedStates,
-    TangentSpace,
     WithoutFailedSteps,
+    counts,
+    economical,
     first_step,
-    unrolled,
+    takes_residuals,
 )
-from ..solvers.tangent_space import TangentPoint
 from .problem import Problem
 from .start import is_saved_part
 from .trajectory_adjoint import as_it_is, can_be_taped
@@ -41,7 +34,7 @@ class Decode(eqx.Module):
 
     def __call__(self, t: Any, y: Any, ode: Any) -> Any:
         if isinstance(self.solver, AbstractManifoldSolver):
-            y = self.solver.land(t, y, ode)
+            y = self.solver.retract(t, y, ode)
         return self.formulation.decode(t, y, ode)
 
 
@@ -62,7 +55,7 @@ def call(solve: Any, problem: Problem) -> tuple[Any, ...]:
     y, ode = solve.formulation.encode(*problem.start, problem.rank)
     decode = Decode(solve.formulation, solve.solver)
     solver, controller = economical(solve.solver, solve.between()), _fitted(solve.controller, t0, t1)
-    if isinstance(solve.formulation, Residual):
+    if takes_residuals(solver):
         solver, controller = _of_residuals(solver, controller)
         dt0 = first_step(ode.start, solver, t0, t1, y) if dt0 is None else dt0
 
@@ -83,8 +76,7 @@ def call(solve: Any, problem: Problem) -> tuple[Any, ...]:
             is_leaf=lambda x: x is None or callable(x),
         ),
     )
-    selects = isinstance(solver, SelectedStates | SelectedResiduals)
-    saveat = dataclasses.replace(saveat, solver_state=True) if selects else saveat
+    saveat = dataclasses.replace(saveat, solver_state=True) if counts(solver) else saveat
     sol = diffrax.diffeqsolve(
         solve.formulation.term(),
         _for_derivative(solve, solver, y),
@@ -92,23 +84,23 @@ def call(solve: Any, problem: Problem) -> tuple[Any, ...]:
         args=ode, saveat=saveat, stepsize_controller=controller, adjoint=solve.adjoint, event=event,
         max_steps=solve.max_steps, throw=False, progress_meter=solve.progress_meter,
     )  # fmt: skip
-    interpolation = None
-    if sol.interpolation is not None:
-        interpolation = Interpolation(_uniform(solve.solver, sol.interpolation), decode, ode)
+    path = sol.interpolation
+    if path is not None and isinstance(solver, AbstractManifoldSolver):
+        path = solver.whole_path(path)
+    interpolation = None if path is None else Interpolation(path, decode, ode)
     ts, ys = cast(Any, sol.ts), cast(Any, sol.ys)
     end = jax.lax.stop_gradient(jax.tree.map(lambda x: x[-1], (ts["end"], ys["end"])))
     stats = {**sol.stats, "end_time": end[0]}
     starts = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(y)]))
     result = RESULTS.where(starts, RESULTS.promote(sol.result), RESULTS.no_finite_start)
-    if selects:
-        stats["switches"] = cast(Any, sol.solver_state).switches
+    stats.update((name, getattr(sol.solver_state, name)) for name in counts(solver))
     return sol.t0, sol.t1, ts["user"], ys["user"], interpolation, stats, result, sol.event_mask, end
 
 
 def _for_derivative(solve: Any, solver: Any, y: Any) -> Any:
     """The solver as diffrax's reverse derivative needs it; the tape knows accepted steps only."""
     size = sum(leaf.size for leaf in jax.tree.leaves(y))
-    ours = isinstance(solver, AbstractManifoldSolver | AbstractResidualSolver) and not hasattr(
+    ours = (isinstance(solver, AbstractManifoldSolver) or takes_residuals(solver)) and not hasattr(
         solver, "root_finder"
     )
     by_diffrax = solve.derivative() == "reverse" and not can_be_taped(solve, size)
@@ -139,14 +131,6 @@ def _of_residuals(solver: Any, controller: Any) -> tuple[Any, Any]:
     return dataclasses.replace(solver, rtol=rtol, atol=atol), controller
 
 
-def _uniform(solver: Any, path: diffrax.DenseInterpolation) -> diffrax.DenseInterpolation:
-    """The dense output with one type of point, also for an interval of length 0."""
-    if not isinstance(solver, TangentSpace):
-        return path
-    first = TangentPoint(path.y0_if_trivial, jax.tree.map(lambda x: x[0], path.infos["normals"]))
-    return eqx.tree_at(lambda p: p.y0_if_trivial, path, first)
-
-
 def _on_states(cond: Callable[..., Any], decode: Any, args: Any, up: bool | None) -> Callable[..., Any]:
     user_args = args
 
@@ -156,12 +140,3 @@ def _on_states(cond: Callable[..., Any], decode: Any, args: Any, up: bool | None
         return value if up is None else jnp.where(jnp.isnan(value), 1 if up else -1, value)
 
     return condition
-
-
-def economical(solver: Any, between: bool) -> Any:
-    """The solver without what this solve does not need, with its stages written out."""
-    if isinstance(solver, OrthogonalProjection | TangentSpace | SelectedResiduals):
-        return dataclasses.replace(solver, solver=economical(solver.solver, between))
-    if isinstance(solver, BDF | DOP853 | RadauIIA5):
-        return dataclasses.replace(solver, dense=between)
-    return unrolled(solver)

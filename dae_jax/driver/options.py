@@ -5,21 +5,13 @@ import typing
 from typing import Any
 
 import diffrax
-import equinox as eqx
 import jax
 import numpy as np
 import optimistix
 from diffrax._root_finder import use_stepsize_tol
 
-from ..formulations import AbstractFormulation, Baumgarte, Differentiation, DummyDerivatives, Residual, StateSpace
-from ..solvers import (
-    RATTLE,
-    AbstractManifoldSolver,
-    AbstractResidualSolver,
-    TangentSpace,
-    unrolled,
-)
-from ..systems import ConstrainedSystem
+from ..formulations import AbstractFormulation, AbstractResidualFormulation
+from ..solvers import AbstractManifoldSolver, is_explicit, takes_residuals
 from ..validate.states import NUMBERS, brief
 from .resets import Jump
 
@@ -100,37 +92,31 @@ def refuse_misfits(system: Any, formulation: Any, solver: Any, t0: Any, y0: Any,
         raise TypeError(
             f"`formulation` must be a formulation such as dae_jax.Baumgarte(...), but is {brief(formulation)}{other}."
         )
-    name = type(solver).__name__
-    if takes_residuals(solver) and not isinstance(formulation, Residual | DummyDerivatives):
+    name, residuals = type(solver).__name__, takes_residuals(solver)
+    is_residual, selects = isinstance(formulation, AbstractResidualFormulation), formulation.selects_states
+    if residuals and not (is_residual or selects):
         raise ValueError(
             f"{name} solves 0 = F(t, y, ẏ) as it is written, and takes no {type(formulation).__name__}: use "
             "`formulation=dae_jax.Residual()`, or no `formulation`."
         )
-    if isinstance(formulation, Residual) and not takes_residuals(solver):
+    if is_residual and not residuals:
         raise ValueError(
-            f"{name} needs an ODE, and Residual is none: solve it with RadauIIA5() or BDF(), or use {name} with "
-            "Differentiation()."
+            f"{name} needs an ODE, and {type(formulation).__name__} is none: solve it with RadauIIA5() or BDF(), or use "
+            f"{name} with Differentiation()."
         )
-    fits = takes_residuals(solver) or hasattr(unrolled(solver), "landing_step")
-    if isinstance(formulation, DummyDerivatives) and not fits:
+    if selects and not (residuals or is_explicit(solver)):
         raise ValueError(
-            "DummyDerivatives takes an explicit Runge–Kutta solver such as DOP853(), RadauIIA5() or BDF(), but got "
-            f"{brief(solver)}."
+            f"{type(formulation).__name__} takes an explicit Runge–Kutta solver such as DOP853(), RadauIIA5() or BDF(), but "
+            f"got {brief(solver)}."
         )
-    if isinstance(formulation, StateSpace) and not isinstance(system, ConstrainedSystem):
-        raise ValueError("StateSpace takes a ConstrainedSystem: its chart gives the positions of a mechanism.")
-    if isinstance(formulation, StateSpace) and isinstance(solver, AbstractManifoldSolver):
-        raise ValueError(
-            f"StateSpace has no constraints left for {name} to keep: in its chart they hold by "
-            "construction. Use the inner solver itself."
-        )
-    if isinstance(formulation, Baumgarte) and (np.shape(formulation.alpha) or np.shape(formulation.beta)):
-        raise ValueError(
-            f"`alpha` and `beta` of Baumgarte must be numbers, but have the shapes {np.shape(formulation.alpha)} and "
-            f"{np.shape(formulation.beta)}: batch over them with `jax.vmap`."
-        )
-    if isinstance(solver, RATTLE):
-        _fits_rattle(system, formulation, t0, y0, args)
+    formulation.refuse(system)
+    if isinstance(solver, AbstractManifoldSolver):
+        if not formulation.leaves_constraints:
+            raise ValueError(
+                f"{type(formulation).__name__} has no constraints left for {name} to keep: in its chart they hold by "
+                "construction. Use the inner solver itself."
+            )
+        solver.refuse(system, formulation, t0, y0, args)
 
 
 def refuse_no_solver(solver: Any) -> None:
@@ -138,7 +124,7 @@ def refuse_no_solver(solver: Any) -> None:
     if not isinstance(solver, diffrax.AbstractSolver):
         other = ": give it as `formulation`" if isinstance(solver, AbstractFormulation) else ""
         raise TypeError(f"`solver` must be a diffrax solver such as diffrax.Tsit5(), but is {brief(solver)}{other}.")
-    if not _takes_one_ode(solver.term_structure):
+    if not (takes_residuals(solver) or _takes_one_ode(solver.term_structure)):
         raise ValueError(
             f"`solver` must be one for ẏ = f(t, y), but {type(solver).__name__} needs equations that are split or have noise: "
             "use diffrax.Tsit5(), dae_jax.RadauIIA5() for stiff equations, or dae_jax.RATTLE() for a symplectic method."
@@ -179,31 +165,8 @@ def _has_no_tolerance(solver: Any) -> bool:
 
 def refuse_no_event(solver: Any) -> None:
     """Refuses solvers whose dense output diffrax cannot look for an event on."""
-    if isinstance(solver, TangentSpace):
+    if not getattr(solver, "locates_events", True):
         raise ValueError(
             "Events need a solution between steps in the coordinates of the step, which the local coordinates of TangentSpace "
             "and of DummyDerivatives with an explicit solver are not; use OrthogonalProjection, RadauIIA5 or BDF."
         )
-
-
-def _fits_rattle(system: ConstrainedSystem, formulation: Any, t0: Any, y0: Any, args: Any) -> None:
-    if not isinstance(system, ConstrainedSystem):
-        raise ValueError("RATTLE takes a ConstrainedSystem; use SymmetricProjection for other systems.")
-    if callable(system.mass):
-        raise ValueError("RATTLE needs a constant mass matrix, but `mass` is a function; use SymmetricProjection.")
-    if system.nonholonomic is not None:
-        raise ValueError("RATTLE takes holonomic constraints only; use SymmetricProjection for nonholonomic ones.")
-    if not isinstance(formulation, Differentiation):
-        raise ValueError(f"RATTLE has its own treatment of the constraints and takes no {type(formulation).__name__}.")
-    q, v = y0
-    arrays, static = eqx.partition(args, eqx.is_array)
-    jaxpr = jax.make_jaxpr(lambda v, q, a: system.force(t0, q, v, eqx.combine(a, static)))(v, q, arrays).jaxpr
-    velocities = jaxpr.invars[: len(jax.tree.leaves(v))]
-    used = [x for eqn in jaxpr.eqns for x in eqn.invars] + list(jaxpr.outvars)
-    if any(x is velocity for x in used for velocity in velocities):
-        raise ValueError("RATTLE needs a force that does not depend on v; use SymmetricProjection.")
-
-
-def takes_residuals(solver: Any) -> bool:
-    """Whether a solver works on 0 = F(t, y, ẏ) in place of an ODE."""
-    return isinstance(solver, AbstractResidualSolver)

@@ -5,8 +5,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from ..formulations import Residual
 from ..solution import RESULTS, DAESolution, all_finite, precision_of
+from ..solvers import takes_residuals
 from .problem import Problem
 from .start import is_saved_part
 
@@ -17,7 +17,7 @@ def judged(solve: Any, out: Any, problem: Problem, found: Any) -> DAESolution:
     (start, _), end, (finite_end, defined) = found
     _, _, ts, ys, *_ = fields
     failed = lambda name, instead, when=True: RESULTS.where((code == name) & when, instead, code)
-    if isinstance(solve.formulation, Residual):
+    if takes_residuals(solve.solver):
         code = failed(RESULTS.dt_min_reached, RESULTS.error_too_large)
         code = failed(RESULTS.nonlinear_divergence, RESULTS.no_convergence)
         code = failed(RESULTS.singular, RESULTS.singular_iteration_matrix)

@@ -15,12 +15,9 @@ from ..consistent import look_at_end, look_at_start
 from ..equations.regularity import COARSE
 from ..formulations import AbstractFormulation
 from ..solution import DAESolution
-from ..solvers import (
-    AbstractManifoldSolver,
-    AbstractResidualSolver,
-)
+from ..solvers import AbstractManifoldSolver, economical, takes_residuals
 from ..validate.user_functions import refuse_wrong_functions, returned
-from .diffrax_call import Decode, View, call, economical
+from .diffrax_call import Decode, View, call
 from .outcome import judged
 from .problem import Problem, Program, Split, split
 from .resets import Jump, refuse_wrong_event, solve_with_jumps
@@ -88,7 +85,7 @@ class Solve(eqx.Module):
 
     def _check(self, problem: Problem, end: Any) -> tuple[Callable[..., Any], list[Any]]:
         """What is wrong with the start and the end, as a function of arrays, and its arrays."""
-        manifold, residual = (isinstance(self.solver, c) for c in (AbstractManifoldSolver, AbstractResidualSolver))
+        manifold, residual = isinstance(self.solver, AbstractManifoldSolver), takes_residuals(self.solver)
         # Points between the steps of a solver of residuals are off by what its dense output is.
         keeps = self.formulation.keeps if not residual or self.event is None else (False, False)
         keeps = (True, True) if manifold else keeps

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from ..solvers import AbstractImplicitSolver, AbstractManifoldSolver, OrthogonalProjection, SelectedStates, unrolled
+from ..solvers import is_recomputable
 from .start import is_saved_part
 
 
@@ -33,18 +33,7 @@ def can_be_taped(solve: Any, size: int) -> bool:
         and type(solve.controller) in (diffrax.PIDController, diffrax.ConstantStepSize)
         and solve.max_steps is not None
         and (solve.max_steps + 1) * size <= LARGEST_TAPE
-        and _remembers_nothing(solve.solver)
-    )
-
-
-def _remembers_nothing(solver: Any) -> bool:
-    """Whether the solver's state can be made anew at each step's start."""
-    if isinstance(solver, SelectedStates):
-        return False
-    if isinstance(solver, OrthogonalProjection):
-        return _remembers_nothing(solver.solver)
-    return isinstance(solver, AbstractManifoldSolver | AbstractImplicitSolver) or hasattr(
-        unrolled(solver), "landing_step"
+        and is_recomputable(solve.solver)
     )
 
 

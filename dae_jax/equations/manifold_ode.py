@@ -56,16 +56,16 @@ class ManifoldODE(eqx.Module):
         """Directions that span a complement of the manifold's tangent space at (t, y), and what is needed to use them."""
 
     @abc.abstractmethod
-    def shift(self, y: Any, normals: Any, mu: Any) -> Any:
+    def displace(self, y: Any, normals: Any, mu: Any) -> Any:
         """y + N μ, with the normals N and a flat vector μ."""
 
     @abc.abstractmethod
-    def restore(self, t: Any, y: Any, normals: Any) -> tuple[Any, Bool[Array, ""]]:
+    def retract_along(self, t: Any, y: Any, normals: Any) -> tuple[Any, Bool[Array, ""]]:
         """The point y + N μ on the manifold at time t, and whether it was found."""
 
     def project(self, t: Any, y: Any) -> tuple[Any, Bool[Array, ""]]:
         """The nearest point on the manifold at time t, with the normals at y itself, and whether it was found."""
-        return self.restore(t, y, self.normals(t, y))
+        return self.retract_along(t, y, self.normals(t, y))
 
     @abc.abstractmethod
     def tangent(self, dy: Any, normals: Any) -> Any:

@@ -222,12 +222,12 @@ class MechanicalODE(ManifoldODE):
         off = self.linear.along(self, normals, x)[:rows]
         return x - self.linear.lift(self, normals, self.linear.gram_solve(self, normals, off)) if off.size else x
 
-    def shift(self, y: Any, normals: Any, mu: Float[Array, " c"]) -> Any:
+    def displace(self, y: Any, normals: Any, mu: Float[Array, " c"]) -> Any:
         q, v = y
         m = self.holonomic
         return q + self.linear.lift(self, normals, mu[:m]), v + self.linear.lift(self, normals, mu[m:])
 
-    def restore(self, t: Any, y: Any, normals: Any) -> tuple[Any, Bool[Array, ""]]:
+    def retract_along(self, t: Any, y: Any, normals: Any) -> tuple[Any, Bool[Array, ""]]:
         q, _ = y
         zero = jnp.zeros(2 * self.holonomic + self.nonholonomic, q.dtype)
         return self._restored(t, y, normals, self.correction(t, y, normals, zero))
@@ -250,8 +250,8 @@ class MechanicalODE(ManifoldODE):
         params = (self, t, y, normals, tuple(jax.lax.stop_gradient(first)))
         linear_solve = solve if self.rank is None else _minimum_norm
         mu, found = implicit_root(_manifold_residual, iterate, params, linear_solve=linear_solve)
-        landed = self.shift(y, normals, mu)
-        return landed, found if self.rank is None else found & self._all_hold(t, landed)
+        displaced = self.displace(y, normals, mu)
+        return displaced, found if self.rank is None else found & self._all_hold(t, displaced)
 
     def _all_hold(self, t: Any, y: Any) -> Bool[Array, ""]:
         """Whether the constraints hold that depend on others: Newton's corrections ask for as many as are independent."""
@@ -266,7 +266,7 @@ class MechanicalODE(ManifoldODE):
         The matrix is A M⁻¹Aᵀ at the current point, which differs from the Jacobian A N by the square of the angle
         between the two normal spaces and stays symmetric.
         """
-        q, v = self.shift(y, normals, mu)
+        q, v = self.displace(y, normals, mu)
         here = self.normals(t, (q, v))
         dq, delta = jnp.zeros_like(q), jnp.zeros(0, q.dtype)
         if self.holonomic:
@@ -279,7 +279,7 @@ class MechanicalODE(ManifoldODE):
 
 def _manifold_residual(mu: Float[Array, " c"], params: Any) -> Float[Array, " c"]:
     ode, t, y, normals, _ = params
-    return jnp.concatenate(ode.invariants(t, ode.shift(y, normals, mu)))
+    return jnp.concatenate(ode.invariants(t, ode.displace(y, normals, mu)))
 
 
 def _minimum_norm(a: Float[Array, "c c"], b: Float[Array, " c"]) -> Float[Array, " c"]:

@@ -222,12 +222,12 @@ class StructuralODE(ManifoldODE):
         if not len(normals):
             return dy
         gram = row_products(normals, normals)
-        return dy - self.shift(0, normals, semidefinite_solve(gram, jnp.sum(normals * dy, 1)))
+        return dy - self.displace(0, normals, semidefinite_solve(gram, jnp.sum(normals * dy, 1)))
 
-    def shift(self, y: Any, normals: Any, mu: Float[Array, " m"]) -> Any:
+    def displace(self, y: Any, normals: Any, mu: Float[Array, " m"]) -> Any:
         return y + jnp.sum(normals * mu[:, None], 0)
 
-    def restore(self, t: Any, y: Any, normals: Any) -> tuple[Any, Bool[Array, ""]]:
+    def retract_along(self, t: Any, y: Any, normals: Any) -> tuple[Any, Bool[Array, ""]]:
         if not len(normals):
             return y, jnp.asarray(True)
 
@@ -235,16 +235,16 @@ class StructuralODE(ManifoldODE):
             ode, t, y, normals = params
 
             def correct(mu: Any) -> tuple[Any, Any]:
-                here = ode.shift(y, normals, mu)
+                here = ode.displace(y, normals, mu)
                 matrix = row_products(ode.normals(t, here), normals)
                 delta = solve(matrix, ode.violations(t, here))
-                return mu - delta, relative_change(ode.shift(0, normals, delta), here)
+                return mu - delta, relative_change(ode.displace(0, normals, delta), here)
 
             return fixed_point(correct, jnp.zeros(len(normals), y.dtype))
 
-        residual = lambda mu, params: params[0].violations(params[1], params[0].shift(params[2], params[3], mu))
+        residual = lambda mu, params: params[0].violations(params[1], params[0].displace(params[2], params[3], mu))
         mu, found = implicit_root(residual, iterate, (self, t, y, normals))
-        return self.shift(y, normals, mu), found
+        return self.displace(y, normals, mu), found
 
     def selection(self, t: Any, y: Any, chosen: Any) -> tuple[Float[Array, "m N"], Bool[Array, ""]]:
         """Unit directions of the dummy derivatives, entries of Y that H = 0 determines given the others, and whether they

@@ -10,10 +10,10 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ..equations.manifold_ode import ManifoldODE
 from ..equations.structural_ode import underlying_ode
-from .differentiation import AbstractFormulation
+from .interface import AbstractFieldFormulation
 
 
-class Baumgarte(AbstractFormulation):
+class Baumgarte(AbstractFieldFormulation):
     """The constraint and its derivative are fed back:
 
         g̈ + 2α ġ + β² g = 0    in place of   g̈ = 0,
@@ -48,6 +48,13 @@ class Baumgarte(AbstractFormulation):
         # Arrays, so that another value is not another compilation.
         self.alpha = jnp.asarray(alpha, jnp.result_type(float, alpha))
         self.beta = jnp.asarray(beta, jnp.result_type(float, beta))
+
+    def refuse(self, system: Any) -> None:
+        if np.shape(self.alpha) or np.shape(self.beta):
+            raise ValueError(
+                f"`alpha` and `beta` of Baumgarte must be numbers, but have the shapes {np.shape(self.alpha)} and "
+                f"{np.shape(self.beta)}: batch over them with `jax.vmap`."
+            )
 
     def encode(
         self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None

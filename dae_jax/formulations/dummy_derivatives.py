@@ -10,11 +10,10 @@ from ..equations.index1_form import ReducedForm
 from ..equations.linearised import Pencil
 from ..equations.residual_form import ResidualForm
 from ..equations.structural_ode import StructuralODE
-from .differentiation import Differentiation
-from .residual import Residual
+from .interface import AbstractFieldFormulation, AbstractResidualFormulation
 
 
-class DummyDerivatives(Differentiation):
+class DummyDerivatives(AbstractFieldFormulation):
     """The equations and their derivatives that structural analysis asks for, with as many *dummy derivatives*: entries of
     (y, ẏ, …) that are not integrated but found from the equations: at each stage of an explicit solver by Newton's method, by
     `RadauIIA5` and `BDF`, for stiff systems, as the algebraic variables of a system of index 1.
@@ -30,19 +29,29 @@ class DummyDerivatives(Differentiation):
     """
 
     inverts_mass: ClassVar[bool] = False
+    selects_states: ClassVar[bool] = True
 
     @property
     def keeps(self) -> tuple[bool, bool]:
         return True, True
 
-    def encode(self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None) -> Any:
+    def encode(self, system: Any, t: Any, state: Any, args: Any = None, rank: Any = None) -> Any:
         form = ResidualForm.of(system, t, state, args)
         ode = StructuralODE.of(form, jnp.result_type(*jax.tree.leaves(state)))
         return ode.encode(t, state), ode
 
+    def field(self, t: Any, y: Any, ode: Any) -> Any:
+        return ode.field(t, y)
 
-class ReducedResidual(Residual):
+
+class ReducedResidual(AbstractResidualFormulation):
     """The equations of `DummyDerivatives` for a solver of residuals: see `ReducedForm`."""
+
+    inverts_mass: ClassVar[bool] = False
+
+    @property
+    def keeps(self) -> tuple[bool, bool]:
+        return True, True
 
     def encode(self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None) -> tuple[Any, Pencil]:
         y, ode = DummyDerivatives().encode(system, t, state, args, rank)

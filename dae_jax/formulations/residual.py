@@ -3,14 +3,13 @@
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax.numpy as jnp
 
 from ..equations.linearised import Pencil
 from ..equations.residual_form import Form, ResidualForm
-from .differentiation import AbstractFormulation
+from .interface import AbstractResidualFormulation
 
 
-class Residual(AbstractFormulation):
+class Residual(AbstractResidualFormulation):
     """No equation is differentiated by hand: 0 = F(t, y, ẏ), for `RadauIIA5` and `BDF`.
 
     **Arguments**
@@ -51,10 +50,6 @@ class Residual(AbstractFormulation):
         form, y = form.at_start(t, state)
         pencil = Pencil.of(form, y, self.variable_index)
         return y, pencil.starting(t, y)
-
-    def field(self, t: Any, y: Any, ode: Any) -> Any:
-        """NaN: a residual has no ẏ in explicit form."""
-        return jnp.full_like(y, jnp.nan)
 
 
 def GGL() -> Residual:

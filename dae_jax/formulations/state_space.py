@@ -15,10 +15,10 @@ from ..equations.manifold_ode import at_one_instant
 from ..equations.mechanical import MechanicalODE
 from ..linalg import newton, semidefinite_solve
 from ..validate.states import NUMBERS
-from .differentiation import AbstractFormulation
+from .interface import AbstractFieldFormulation
 
 
-class StateSpace(AbstractFormulation):
+class StateSpace(AbstractFieldFormulation):
     """Coordinates z in which the constraints hold by construction, q = ψ(t, z), and the equations of motion in them,
 
         Jᵀ M J z̈ = Jᵀ (f − M c),   J = ∂ψ/∂z,   c = d(J ż + ψ_t)/dt at z̈ = 0,
@@ -36,6 +36,7 @@ class StateSpace(AbstractFormulation):
     """
 
     inverts_mass: ClassVar[bool] = False
+    leaves_constraints: ClassVar[bool] = False
 
     chart: Callable[..., Any]
     guess: Any = None
@@ -49,6 +50,10 @@ class StateSpace(AbstractFormulation):
     @property
     def keeps(self) -> tuple[bool, bool]:
         return True, True
+
+    def refuse(self, system: Any) -> None:
+        if not hasattr(system, "constraint"):
+            raise ValueError("StateSpace takes a ConstrainedSystem: its chart gives the positions of a mechanism.")
 
     def encode(
         self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None

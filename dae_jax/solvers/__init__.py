@@ -1,8 +1,14 @@
 """How one step is taken: one file a method, each a diffrax solver."""
 
+from .abilities import (
+    counts as counts,
+    economical as economical,
+    is_explicit as is_explicit,
+    is_recomputable as is_recomputable,
+    takes_residuals as takes_residuals,
+)
 from .bdf import BDF as BDF
 from .dop853 import DOP853 as DOP853
-from .explicit import unrolled as unrolled
 from .failed_steps import WithoutFailedSteps as WithoutFailedSteps
 from .gauss import Gauss4 as Gauss4
 from .implicit import AbstractImplicitSolver as AbstractImplicitSolver

@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ..linalg import implicit_root, rms_norm
-from .manifold import clock
+from .manifold import time_sign
 from .residual_steps import (
     FULL,
     AbstractResidualSolver,
@@ -146,7 +146,7 @@ class BDF(AbstractResidualSolver):
         return ERROR_ORDER
 
     def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> _State:
-        sign = clock(terms, t0, t1)
+        sign = time_sign(terms, t0, t1)
         like = _Step(args, sign, t1, t1 - t0, 1 / (t1 - t0), y0, y0)
         factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda: like.factor(y0)[0]))
         return _start(sign * args.start, factors)
@@ -157,7 +157,7 @@ class BDF(AbstractResidualSolver):
     def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: _State, made_jump: Any) -> Any:
         # A lane of a batch that has ended goes on with steps of length 0, whose derivatives are multiplied by 0.
         h = jnp.where(t1 == t0, 1, t1 - t0)
-        sign, state = clock(terms, t0, t1), solver_state
+        sign, state = time_sign(terms, t0, t1), solver_state
         if made_jump is not False:
             state = lax.cond(
                 made_jump, lambda: _start(sign * constant(args.rates(sign * t0, y0)), state.factors), lambda: state

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from . import dop853_coefficients as coefficients
-from .explicit import Flat, advanced, combine, first_derivative, identity, stage_slopes, with_landing
+from .explicit import Flat, advanced, combine, first_derivative, identity, stage_slopes, with_retraction
 
 
 STAGES = 12
@@ -64,25 +64,25 @@ class DOP853(diffrax.AbstractAdaptiveSolver):
         return terms.vf(t0, y0, args)
 
     def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any) -> Any:
-        *step, _ = self.landing_step(terms, t0, t1, y0, args, solver_state, made_jump, identity)
+        *step, _ = self.step_and_retract(terms, t0, t1, y0, args, solver_state, made_jump, identity)
         return *step, diffrax.RESULTS.successful
 
-    def landing_step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, state: Any, made_jump: Any, land: Callable[..., Any]
+    def step_and_retract(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, state: Any, made_jump: Any, retract: Callable[..., Any]
     ) -> Any:
-        """`step`, with its end moved to `land(t1, y1)` → (y1, found)."""
+        """`step`, with its end moved to `retract(t1, y1)` → (y1, found)."""
         h = terms.contr(t0, t1)
-        flat = Flat(terms, t0, y0, args, land)
+        flat = Flat(terms, t0, y0, args, retract)
         f0 = first_derivative(flat, t0, state, made_jump)
         rows, nodes = _ROWS[: STAGES - 1], coefficients.C[1:STAGES]
         fs = stage_slopes(rows, nodes, flat.field, t0, t1, h, flat.y0, f0, flat.looped)
         slope = combine(coefficients.B, fs)
         ahead = flat.y0 + h * slope
-        y1, found = flat.land(t1, ahead)
+        y1, found = flat.retract(t1, ahead)
         f1 = flat.field(t1, y1)
         fs.append(f1)
         error = h * _error(combine(coefficients.E5, fs), slope - combine(_B_MINUS_E3, fs), flat.y0, y1)
-        error = with_landing(error, ahead, y1)
+        error = with_retraction(error, ahead, y1)
         rest = self._interpolant(flat, t0, t1, h, y1, fs) if self.dense else [y1 - flat.y0]
         dense = {"y0": y0, "f": jax.tree.map(lambda *f: jnp.stack(f), *map(flat.tree, rest))}
         return flat.tree(y1), flat.tree(error), dense, flat.tree(f1), found

@@ -80,12 +80,12 @@ def _slopes_in_a_loop(a: Any, c: Any, field: Any, t0: Any, t1: Any, h: Any, y0: 
 
 
 class Flat:
-    """The field, the state and `land` of a step on one vector, in which every linear combination is one loop."""
+    """The field, the state and `retract` of a step on one vector, in which every linear combination is one loop."""
 
-    def __init__(self, terms: Any, t0: Any, y0: Any, args: Any, land: Callable[..., Any]) -> None:
+    def __init__(self, terms: Any, t0: Any, y0: Any, args: Any, retract: Callable[..., Any]) -> None:
         self.y0, self.tree = ravel_pytree(y0)
         self.field = subroutine(scalarise(lambda t, y: self.vector(terms.vf(t, self.tree(y), args))))
-        self._land = land
+        self._retract = retract
         self.looped = self.y0.size > UNROLLED or getattr(terms, "looped", False) or is_large(self.field, t0, self.y0)
 
     @staticmethod
@@ -93,18 +93,18 @@ class Flat:
         """The numbers of a pytree."""
         return ravel_pytree(tree)[0]
 
-    def land(self, t: Any, y: Any) -> tuple[Any, Any]:
+    def retract(self, t: Any, y: Any) -> tuple[Any, Any]:
         """Where a point lands, and whether it was found."""
-        if self._land is identity:
+        if self._retract is identity:
             return y, True
-        end, found = self._land(t, self.tree(y))
+        end, found = self._retract(t, self.tree(y))
         return self.vector(end), found
 
 
 class Unrolled(diffrax.AbstractWrappedSolver):
     """An explicit diffrax Runge–Kutta solver with its stages written out, equal to it up to round-off.
 
-    The wrapped solver's tableau and interpolation are used as they are. `land` is applied to the end of the step before
+    The wrapped solver's tableau and interpolation are used as they are. `retract` is applied to the end of the step before
     the last stage of a method whose last stage is there, so that the derivative carried to the next step (first same as
     last) belongs to the point where the step really ended.
     """
@@ -136,43 +136,43 @@ class Unrolled(diffrax.AbstractWrappedSolver):
         return terms.vf(t0, y0, args) if self.solver.tableau.fsal else None
 
     def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any) -> Any:
-        *step, _ = self.landing_step(terms, t0, t1, y0, args, solver_state, made_jump, identity)
+        *step, _ = self.step_and_retract(terms, t0, t1, y0, args, solver_state, made_jump, identity)
         return *step, diffrax.RESULTS.successful
 
-    def landing_step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, state: Any, made_jump: Any, land: Callable[..., Any]
+    def step_and_retract(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, state: Any, made_jump: Any, retract: Callable[..., Any]
     ) -> Any:
-        """`step`, with its end moved to `land(t1, y1)` → (y1, found)."""
+        """`step`, with its end moved to `retract(t1, y1)` → (y1, found)."""
         tableau = self.solver.tableau
         h = terms.contr(t0, t1)
-        flat = Flat(terms, t0, y0, args, land)
+        flat = Flat(terms, t0, y0, args, retract)
         f0 = first_derivative(flat, t0, state, made_jump)
         rows, nodes = tableau.a_lower, tableau.c
         f1 = None
         if tableau.fsal:
             fs = stage_slopes(rows[:-1], nodes[:-1], flat.field, t0, t1, h, flat.y0, f0, flat.looped)
             ahead = flat.y0 + h * combine(rows[-1], fs)
-            y1, found = flat.land(t1, ahead)
+            y1, found = flat.retract(t1, ahead)
             f1 = flat.field(t1, y1)
             fs.append(f1)
         else:
             fs = stage_slopes(rows, nodes, flat.field, t0, t1, h, flat.y0, f0, flat.looped)
             ahead = flat.y0 + h * combine(tableau.b_sol, fs)
-            y1, found = flat.land(t1, ahead)
+            y1, found = flat.retract(t1, ahead)
         estimates = np.any(tableau.b_error)
-        error = flat.tree(with_landing(h * combine(tableau.b_error, fs), ahead, y1)) if estimates else None
+        error = flat.tree(with_retraction(h * combine(tableau.b_error, fs), ahead, y1)) if estimates else None
         dense = {"y0": y0, "y1": flat.tree(y1), "k": jax.tree.map(lambda *f: h * jnp.stack(f), *map(flat.tree, fs))}
         return flat.tree(y1), error, dense, None if f1 is None else flat.tree(f1), found
 
 
-def with_landing(error: Array, ahead: Array, landed: Array) -> Array:
+def with_retraction(error: Array, ahead: Array, retracted: Array) -> Array:
     """The error, and where it is more how far the end was moved: a manifold that jumps does not show in the stages. What
     the user's start may be off by does not count.
     """
-    if landed is ahead:
+    if retracted is ahead:
         return error
-    moved = landed - ahead
-    allowed = 2 * float(jnp.finfo(moved.dtype).eps) ** 0.5 * (1 + jnp.max(jnp.abs(landed)))
+    moved = retracted - ahead
+    allowed = 2 * float(jnp.finfo(moved.dtype).eps) ** 0.5 * (1 + jnp.max(jnp.abs(retracted)))
     return jnp.where(jnp.abs(moved) > jnp.maximum(jnp.abs(error), allowed), moved, error)
 
 

@@ -1,7 +1,7 @@
 """Implicit Runge–Kutta steps solved by Newton's method on all stages together."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import diffrax
 import jax
@@ -27,6 +27,7 @@ class AbstractImplicitSolver(diffrax.AbstractSolver):
 
     term_structure = diffrax.ODETerm
     interpolation_cls = diffrax.ThirdOrderHermitePolynomialInterpolation.from_k
+    recomputable: ClassVar[bool] = True
 
     @property
     def tableau(self) -> Tableau:

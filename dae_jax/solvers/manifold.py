@@ -1,7 +1,7 @@
 """What the solvers that keep their steps on the manifold have in common."""
 
 import abc
-from typing import Any
+from typing import Any, ClassVar
 
 import diffrax
 import jax
@@ -10,17 +10,36 @@ from jaxtyping import Array, Bool
 
 
 class AbstractManifoldSolver(diffrax.AbstractSolver):
-    """A solver whose steps end on the manifold H(t, y) = 0; needs a `ManifoldODE` as `args`."""
+    """A solver whose steps end on the manifold H(t, y) = 0; needs a `ManifoldODE` as `args`.
+
+    What a solver can do is asked of it, by these and by the fields `solver`, of one that wraps another, and `dense`, of
+    one that can do without dense output:
+
+    - `recomputable`: whether a step can be done once more from its start alone.
+    - `locates_events`: whether diffrax can look for an event on its dense output.
+    - `counts`: which entries of its state at the end of a solve are counts for `stats`.
+    """
+
+    recomputable: ClassVar[bool] = True
+    locates_events: ClassVar[bool] = True
+    counts: ClassVar[tuple[str, ...]] = ()
 
     @abc.abstractmethod
-    def land(self, t: Any, y: Any, ode: Any) -> Any:
+    def retract(self, t: Any, y: Any, ode: Any) -> Any:
         """The point of the manifold that a point of the solver's dense output stands for."""
+
+    def refuse(self, system: Any, formulation: Any, t0: Any, y0: Any, args: Any) -> None:
+        """Refuses, by a `ValueError` with advice, what the method is not for."""
+
+    def whole_path(self, path: diffrax.DenseInterpolation) -> diffrax.DenseInterpolation:
+        """The dense output of a solve, also that of an interval of length 0."""
+        return path
 
     def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
         return terms.vf(t0, y0, args)
 
 
-def clock(terms: Any, t0: Any, t1: Any) -> Any:
+def time_sign(terms: Any, t0: Any, t1: Any) -> Any:
     """±1: diffrax steps forwards in t·(±1); a constraint is to be evaluated at t itself."""
     return jnp.sign(terms.contr(t0, t1)) * jnp.sign(t1 - t0)
 

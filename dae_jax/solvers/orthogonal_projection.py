@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 
 from ..validate.states import brief
-from .explicit import unrolled, with_landing
-from .manifold import AbstractManifoldSolver, clock, or_nan, outcome
+from .abilities import is_recomputable
+from .explicit import unrolled, with_retraction
+from .manifold import AbstractManifoldSolver, or_nan, outcome, time_sign
 from .residual_steps import AbstractResidualSolver
 
 
@@ -41,6 +42,10 @@ class OrthogonalProjection(diffrax.AbstractWrappedSolver, AbstractManifoldSolver
             raise ValueError(
                 f"OrthogonalProjection takes a solver of ODEs such as diffrax.Tsit5(), but got {brief(self.solver)}{alone}."
             )
+
+    @property
+    def recomputable(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return is_recomputable(self.solver)
 
     @property
     def term_structure(self) -> Any:
@@ -76,22 +81,22 @@ class OrthogonalProjection(diffrax.AbstractWrappedSolver, AbstractManifoldSolver
 
     def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any) -> Any:
         solver = unrolled(self.solver)
-        sign = clock(terms, t0, t1)
+        sign = time_sign(terms, t0, t1)
 
-        def land(t: Any, y: Any) -> Any:
+        def retract(t: Any, y: Any) -> Any:
             return args.project(sign * t, y)
 
-        if hasattr(solver, "landing_step"):
-            y1, error, dense, state, found = solver.landing_step(terms, t0, t1, y0, args, solver_state, made_jump, land)
+        if hasattr(solver, "step_and_retract"):
+            y1, error, dense, state, found = solver.step_and_retract(terms, t0, t1, y0, args, solver_state, made_jump, retract)
             result = diffrax.RESULTS.successful
         else:
             ahead, error, dense, state, result = solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
-            y1, found = land(t1, ahead)
-            error = None if error is None else jax.tree.map(with_landing, error, ahead, y1)
+            y1, found = retract(t1, ahead)
+            error = None if error is None else jax.tree.map(with_retraction, error, ahead, y1)
         error = None if error is None else or_nan(found, error)
         result = diffrax.RESULTS.where(result == diffrax.RESULTS.successful, outcome(jnp.asarray(found)), result)
         return or_nan(found, y1), error, dense, state, result
 
-    def land(self, t: Any, y: Any, ode: Any) -> Any:
+    def retract(self, t: Any, y: Any, ode: Any) -> Any:
         y, found = ode.project(t, y)
         return or_nan(found, y)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..compiler import is_large
 from ..linalg import implicit_root
-from .manifold import clock
+from .manifold import time_sign
 from .radau_coefficients import (
     ALPHA,
     AT_START,
@@ -186,7 +186,7 @@ class RadauIIA5(AbstractResidualSolver):
         return 4
 
     def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> _State:
-        sign = clock(terms, t0, t1)
+        sign = time_sign(terms, t0, t1)
         zero = jnp.zeros((), y0.dtype)
         step = _Step(args, sign, t0, t1, y0)
         unused = jax.eval_shape(lambda: (j := step.jacobians(t0, y0, y0), step.factor(j)[0]))
@@ -202,7 +202,7 @@ class RadauIIA5(AbstractResidualSolver):
         state = solver_state._replace(
             refresh=solver_state.refresh | made_jump, h=jnp.where(made_jump, 0, solver_state.h)
         )
-        step = _Step(args, clock(terms, t0, t1), t0, t1, y0)
+        step = _Step(args, time_sign(terms, t0, t1), t0, t1, y0)
         tol = tolerances(self.rtol, self.atol, y0.dtype)
         # The unknowns of a stage are interleaved, so that a band stays one.
         apart = lambda z: z.reshape(-1, 3).T

@@ -3,11 +3,13 @@
 from typing import Any
 
 import diffrax
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 
 from ..equations.constraint_jacobian import mass_solve
 from .implicit import hermite
-from .manifold import AbstractManifoldSolver, clock, or_nan, outcome
+from .manifold import AbstractManifoldSolver, or_nan, outcome, time_sign
 
 
 class RATTLE(AbstractManifoldSolver):
@@ -26,6 +28,20 @@ class RATTLE(AbstractManifoldSolver):
     term_structure = diffrax.ODETerm
     interpolation_cls = diffrax.ThirdOrderHermitePolynomialInterpolation.from_k
 
+    def refuse(self, system: Any, formulation: Any, t0: Any, y0: Any, args: Any) -> None:
+        if not hasattr(system, "mass"):
+            raise ValueError("RATTLE takes a ConstrainedSystem; use SymmetricProjection for other systems.")
+        if callable(system.mass):
+            raise ValueError("RATTLE needs a constant mass matrix, but `mass` is a function; use SymmetricProjection.")
+        if system.nonholonomic is not None:
+            raise ValueError("RATTLE takes holonomic constraints only; use SymmetricProjection for nonholonomic ones.")
+        if formulation.changes_field:
+            raise ValueError(
+                f"RATTLE has its own treatment of the constraints and takes no {type(formulation).__name__}."
+            )
+        if _force_uses_velocity(system, t0, y0, args):
+            raise ValueError("RATTLE needs a force that does not depend on v; use SymmetricProjection.")
+
     def order(self, terms: Any) -> int:
         return 2
 
@@ -33,24 +49,33 @@ class RATTLE(AbstractManifoldSolver):
         return None
 
     def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any) -> Any:
-        sign, h = clock(terms, t0, t1), terms.contr(t0, t1)
+        sign, h = time_sign(terms, t0, t1), terms.contr(t0, t1)
         q0, v0 = y0
         t0_, t1_ = sign * t0, sign * t1
         half = v0 + h / 2 * _free(args, t0_, q0, v0)
         chart = args.normals(t0_, y0)
-        (q1, _), found = args.restore(t1_, (q0 + h * half, half), chart)
+        (q1, _), found = args.retract_along(t1_, (q0 + h * half, half), chart)
         half = (q1 - q0) / h
         free = half + h / 2 * _free(args, t1_, q1, half)
         # q₁ is on the manifold; what is restored is the velocity.
-        (_, v1), settled = args.restore(t1_, (q1, free), args.normals(t1_, (q1, free)))
+        (_, v1), settled = args.retract_along(t1_, (q1, free), args.normals(t1_, (q1, free)))
         found = found & settled
         y1 = or_nan(found, (q1, v1))
         return y1, None, hermite(terms, args, t0, t1, y0, y1), None, outcome(jnp.asarray(found))
 
-    def land(self, t: Any, y: Any, ode: Any) -> Any:
-        y, found = ode.restore(t, y, ode.normals(t, y))
+    def retract(self, t: Any, y: Any, ode: Any) -> Any:
+        y, found = ode.retract_along(t, y, ode.normals(t, y))
         return or_nan(found, y)
 
 
 def _free(ode: Any, t: Any, q: Any, v: Any) -> Any:
     return mass_solve(ode.mass(q), ode.force(t, q, v))
+
+
+def _force_uses_velocity(system: Any, t0: Any, y0: Any, args: Any) -> bool:
+    q, v = y0
+    arrays, static = eqx.partition(args, eqx.is_array)
+    jaxpr = jax.make_jaxpr(lambda v, q, a: system.force(t0, q, v, eqx.combine(a, static)))(v, q, arrays).jaxpr
+    velocities = jaxpr.invars[: len(jax.tree.leaves(v))]
+    used = [x for eqn in jaxpr.eqns for x in eqn.invars] + list(jaxpr.outvars)
+    return any(x is velocity for x in used for velocity in velocities)

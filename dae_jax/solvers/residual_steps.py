@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -34,11 +34,13 @@ class AbstractResidualSolver(diffrax.AbstractAdaptiveSolver):
     # Up to which index the method converges, and takes the equations as they are written where nothing else is asked for.
     highest_index: eqx.AbstractClassVar[int]
     default_index: eqx.AbstractClassVar[int]
+    # Which entries of its state at the end of a solve are counts for `stats`.
+    counts: ClassVar[tuple[str, ...]] = ()
 
     rtol: Any = None
     atol: Any = None
 
-    term_structure = diffrax.ODETerm
+    term_structure = diffrax.AbstractTerm
 
     def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
         return terms.vf(t0, y0, args)

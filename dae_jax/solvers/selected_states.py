@@ -1,15 +1,15 @@
 """Steps in coordinates that are chosen among the entries of the state, and chosen again when they turn bad."""
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .manifold import clock
+from .chart_steps import AbstractChartSolver
+from .manifold import time_sign
 from .residual_steps import AbstractResidualSolver, constant
-from .tangent_space import TangentSpace
 
 
 class Selection(NamedTuple):
@@ -22,17 +22,20 @@ class Selection(NamedTuple):
     switches: Any
 
 
-class SelectedStates(TangentSpace):
+class SelectedStates(AbstractChartSolver):
     """A step of an explicit solver in some entries of the state, its *states*; the others, as many as there are
     constraints, are found from H(t, y) = 0 by Newton's method at each stage. Used by `DummyDerivatives`, which see.
     """
 
+    recomputable: ClassVar[bool] = False
+    counts: ClassVar[tuple[str, ...]] = ("switches",)
+
     def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Selection:
-        directions, _ = args.selection(clock(terms, t0, t1) * t0, y0, None)
+        directions, _ = args.selection(time_sign(terms, t0, t1) * t0, y0, None)
         return Selection(terms.vf(t0, y0, args), directions, jnp.asarray(0))
 
     def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Selection, made_jump: Any) -> Any:
-        directions, switched = args.selection(clock(terms, t0, t1) * t0, y0, solver_state.directions)
+        directions, switched = args.selection(time_sign(terms, t0, t1) * t0, y0, solver_state.directions)
         y1, error, dense, derivative, result = self.step_in(
             directions, terms, t0, t1, y0, args, solver_state.inner, made_jump
         )
@@ -49,6 +52,7 @@ class SelectedResiduals(AbstractResidualSolver):
 
     highest_index = 1
     default_index = 1
+    counts: ClassVar[tuple[str, ...]] = ("switches",)
 
     @property
     def interpolation_cls(self) -> Any:
@@ -68,7 +72,7 @@ class SelectedResiduals(AbstractResidualSolver):
 
     def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Selection, made_jump: Any) -> Any:
         ode = args.form.ode
-        directions, switched = ode.selection(clock(terms, t0, t1) * t0, y0[: ode.orders.size], solver_state.directions)
+        directions, switched = ode.selection(time_sign(terms, t0, t1) * t0, y0[: ode.orders.size], solver_state.directions)
         solver = dataclasses.replace(self.solver, rtol=self.rtol, atol=self.atol)
         pencil = eqx.tree_at(lambda p: p.form.directions, args, directions)
         state = jax.tree.map(lambda a, b: jnp.where(switched, a, b), self.forget(solver_state), solver_state)

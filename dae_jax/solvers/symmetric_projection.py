@@ -10,7 +10,7 @@ from jax.flatten_util import ravel_pytree
 from ..linalg import newton
 from ..validate.states import brief
 from .implicit import AbstractImplicitSolver, hermite, predictor, stage_end, stage_residual, vector_field
-from .manifold import AbstractManifoldSolver, clock, or_nan, outcome
+from .manifold import AbstractManifoldSolver, or_nan, outcome, time_sign
 
 
 class SymmetricProjection(AbstractManifoldSolver):
@@ -53,11 +53,11 @@ class SymmetricProjection(AbstractManifoldSolver):
 
         def residual(x: Any, params: Any) -> Any:
             terms, args, t0, t1, y0 = params
-            sign = clock(terms, t0, t1)
+            sign = time_sign(terms, t0, t1)
             z, y1, mu = x[:stages], unravel(x[stages : stages + flat.size]), x[stages + flat.size :]
-            start = args.shift(y0, args.normals(sign * t0, y0), mu)
+            start = args.displace(y0, args.normals(sign * t0, y0), mu)
             end = stage_end(tableau, terms, args, t0, t1, start, z)
-            projected = args.shift(end, args.normals(sign * t1, y1), mu)
+            projected = args.displace(end, args.normals(sign * t1, y1), mu)
             return jnp.concatenate(
                 [
                     stage_residual(tableau, terms, args, t0, t1, start, z),
@@ -73,6 +73,6 @@ class SymmetricProjection(AbstractManifoldSolver):
         y1 = or_nan(found, unravel(x[stages : stages + flat.size]))
         return y1, None, hermite(terms, args, t0, t1, y0, y1), None, outcome(found)
 
-    def land(self, t: Any, y: Any, ode: Any) -> Any:
+    def retract(self, t: Any, y: Any, ode: Any) -> Any:
         y, found = ode.project(t, y)
         return or_nan(found, y)

@@ -2,42 +2,11 @@
 
 from typing import Any
 
-import diffrax
-import equinox as eqx
-import jax
-import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
-
-from ..validate.states import brief
-from .explicit import Unrolled, identity, unrolled
-from .manifold import AbstractManifoldSolver, clock, or_nan, outcome
+from .chart_steps import AbstractChartSolver
+from .manifold import time_sign
 
 
-# A step may be this much longer than the time times the speed at its two ends.
-SPEEDS = 10
-
-
-class TangentPoint(eqx.Module):
-    """A point of the tangent space at a step's start, with the normals there."""
-
-    y: Any
-    normals: Any
-
-
-class _Interpolation(diffrax.AbstractLocalInterpolation):
-    t0: Any
-    t1: Any
-    inner: Any
-    normals: Any
-    cls: Any = eqx.field(static=True)
-
-    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Any:
-        if t1 is not None:
-            return jax.tree.map(lambda a, b: b - a, self.evaluate(t0), self.evaluate(t1))
-        return TangentPoint(self.cls(t0=self.t0, t1=self.t1, **self.inner).evaluate(t0), self.normals)
-
-
-class TangentSpace(AbstractManifoldSolver, diffrax.AbstractAdaptiveSolver):
+class TangentSpace(AbstractChartSolver):
     """A step of an explicit solver in the coordinates of the tangent space at the step's start.
 
     With the normals N = M⁻¹Aᵀ at y₀ = (q₀, v₀) and the projection P = I − N(AN)⁻¹A along them (orthogonal in the metric
@@ -56,91 +25,9 @@ class TangentSpace(AbstractManifoldSolver, diffrax.AbstractAdaptiveSolver):
     *Geometric Numerical Integration*, IV.5.
     """
 
-    solver: diffrax.AbstractSolver
-
-    def __check_init__(self) -> None:
-        if not hasattr(unrolled(self.solver), "landing_step"):
-            raise ValueError(
-                f"TangentSpace takes an explicit Runge–Kutta solver such as diffrax.Tsit5(), but got {brief(self.solver)}. "
-                "For an implicit one use OrthogonalProjection."
-            )
-
-    @property
-    def term_structure(self) -> Any:
-        return diffrax.ODETerm
-
-    @property
-    def interpolation_cls(self) -> Any:
-        inner = self.solver.interpolation_cls
-        return lambda t0, t1, inner_info, normals: _Interpolation(t0, t1, inner_info, normals, inner)
-
-    def order(self, terms: Any) -> Any:
-        return self.solver.order(terms)
-
-    def error_order(self, terms: Any) -> Any:
-        return self.solver.error_order(terms)
-
     def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Any:
         return terms.vf(t0, y0, args)
 
     def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any) -> Any:
-        chart = args.normals(clock(terms, t0, t1) * t0, y0)
+        chart = args.normals(time_sign(terms, t0, t1) * t0, y0)
         return self.step_in(chart, terms, t0, t1, y0, args, solver_state, made_jump)
-
-    def step_in(
-        self, chart: Any, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, derivative: Any, made_jump: Any
-    ) -> Any:
-        """The step in the chart in which a point moves along `chart` on to the manifold; `derivative` is ẏ at y₀."""
-        sign = clock(terms, t0, t1)
-        solver = unrolled(self.solver)
-        assert isinstance(solver, Unrolled) or hasattr(solver, "landing_step")
-
-        # The end of the step is the lift of the last stage's point; its derivative is the next step's first.
-        tangent_term = diffrax.ODETerm(lambda t, u, _: _field(terms, sign, args, chart, t, u)[0])
-        first = args.tangent(derivative, chart) if made_jump is False else None
-        first = tangent_term.vf(t0, y0, None) if first is None else first
-        wrapped = _Controlled(tangent_term, terms)
-        u1, error, dense, _, _ = solver.landing_step(wrapped, t0, t1, y0, None, first, False, identity)
-        y1, found = args.restore(sign * t1, u1, chart)
-        y1 = or_nan(found, y1)
-        end = terms.vf(t1, y1, args)
-        if error is not None:
-            error = or_nan(found & ~_jumps(y0, y1, derivative, end, terms.contr(t0, t1)), error)
-        info = {"inner_info": dense, "normals": chart}
-        return y1, error, info, end, outcome(found)
-
-    def land(self, t: Any, y: Any, ode: Any) -> Any:
-        if not isinstance(y, TangentPoint):
-            return y
-        y, found = ode.restore(t, y.y, y.normals)
-        return or_nan(found, y)
-
-
-class _Controlled(eqx.Module):
-    """The field in the chart with the step of the outer term. It is a large program: the stages are looped."""
-
-    term: diffrax.ODETerm
-    outer: Any
-    looped: bool = eqx.field(static=True, default=True)
-
-    def vf(self, t: Any, y: Any, args: Any) -> Any:
-        return self.term.vf(t, y, args)
-
-    def contr(self, t0: Any, t1: Any) -> Any:
-        return self.outer.contr(t0, t1)
-
-
-def _jumps(y0: Any, y1: Any, start: Any, end: Any, h: Any) -> Any:
-    """Whether a step is much longer than the speed at its ends explains: where the manifold jumps in time, the point of the
-    chart is lifted on to it all the same.
-    """
-    y0, y1, start, end = (ravel_pytree(x)[0] for x in (y0, y1, start, end))
-    largest = lambda x: jnp.max(jnp.abs(x))
-    allowed = float(jnp.finfo(y0.dtype).eps) ** 0.5 * (1 + largest(y1))
-    return largest(y1 - y0) > allowed + SPEEDS * jnp.abs(h) * (largest(start) + largest(end))
-
-
-def _field(terms: Any, sign: Any, ode: Any, chart: Any, t: Any, u: Any) -> Any:
-    y, found = ode.restore(sign * t, u, chart)
-    dy = ode.tangent(terms.vf(t, y, ode), chart)
-    return or_nan(jnp.asarray(found), dy), y

@@ -1,0 +1,80 @@
+"""What a formulation is: which equations of a system are integrated, and by which kind of solver."""
+
+import abc
+from typing import Any, ClassVar
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+
+
+class AbstractFormulation(eqx.Module):
+    """Which equations of a system are integrated.
+
+    For those who call `diffrax.diffeqsolve` themselves:
+
+        y0, ode = formulation.encode(system, t0, state, args)
+        sol = diffrax.diffeqsolve(formulation.term(), solver, t0, t1, dt0, y0, args=ode)
+        state = formulation.decode(t, y, ode)
+
+    - `inverts_mass`: whether M⁻¹ is needed, so that no coordinate can be massless.
+    - `keeps`: whether g and (ġ, h) hold whatever the solver does.
+    - `leaves_constraints`: whether there are constraints left that a solver can keep.
+    - `selects_states`: whether entries of the state are selected that alone are integrated.
+    - `changes_field`: whether the field is another than that of the underlying ODE.
+    """
+
+    inverts_mass: ClassVar[bool] = True
+    leaves_constraints: ClassVar[bool] = True
+    selects_states: ClassVar[bool] = False
+    changes_field: ClassVar[bool] = True
+
+    @property
+    def keeps(self) -> tuple[bool, bool]:
+        return False, False
+
+    def refuse(self, system: Any) -> None:
+        """Refuses, by a `ValueError` with advice, what the formulation is not for."""
+
+    @abc.abstractmethod
+    def encode(self, system: Any, t: Any, state: Any, args: Any = None, rank: Any = None) -> tuple[Any, Any]:
+        """The integration variables of `state`, and the equations at one instant, which the solver gets as `args`."""
+
+    @abc.abstractmethod
+    def term(self) -> diffrax.AbstractTerm:
+        """What diffrax gets."""
+
+    def decode(self, t: Any, y: Any, ode: Any) -> Any:
+        """The state in the user's structure."""
+        return ode.decode(t, y)
+
+
+class AbstractFieldFormulation(AbstractFormulation):
+    """A formulation as an ODE ẏ = field(t, y), for solvers of ODEs."""
+
+    @abc.abstractmethod
+    def field(self, t: Any, y: Any, ode: Any) -> Any:
+        """ẏ at (t, y)."""
+
+    def term(self) -> diffrax.ODETerm:
+        return diffrax.ODETerm(self.field)
+
+
+class ResidualTerm(diffrax.AbstractTerm):
+    """0 = F(t, y, ẏ) where diffrax wants a vector field: what it gets is F(t, y, 0). For solvers of residuals only."""
+
+    def vf(self, t: Any, y: Any, args: Any) -> Any:
+        return args.residual(t, y, jnp.zeros_like(y))
+
+    def contr(self, t0: Any, t1: Any, **kwargs: Any) -> Any:
+        return t1 - t0
+
+    def prod(self, vf: Any, control: Any) -> Any:
+        return vf * control
+
+
+class AbstractResidualFormulation(AbstractFormulation):
+    """A formulation as a residual 0 = F(t, y, ẏ), for solvers of residuals."""
+
+    def term(self) -> ResidualTerm:
+        return ResidualTerm()

@@ -1,0 +1,40 @@
+"""What a solver can do, asked of its interface: also of one that is written outside of this package."""
+
+import dataclasses
+from typing import Any
+
+from .explicit import unrolled
+from .manifold import AbstractManifoldSolver
+from .residual_steps import AbstractResidualSolver
+
+
+def economical(solver: Any, between: bool) -> Any:
+    """The solver without what a solve does not need, with its stages written out; `between`: points between steps are asked
+    for.
+    """
+    fields = {field.name for field in dataclasses.fields(solver)}
+    if "dense" in fields:
+        return dataclasses.replace(solver, dense=between)
+    if "solver" in fields and isinstance(solver, AbstractManifoldSolver | AbstractResidualSolver):
+        return dataclasses.replace(solver, solver=economical(solver.solver, between))
+    return unrolled(solver)
+
+
+def is_explicit(solver: Any) -> bool:
+    """Whether a solver is an explicit Runge–Kutta method whose stages can be taken elsewhere than its state."""
+    return hasattr(unrolled(solver), "step_and_retract")
+
+
+def is_recomputable(solver: Any) -> bool:
+    """Whether a step can be done once more from its start alone."""
+    return is_explicit(solver) or getattr(solver, "recomputable", False)
+
+
+def takes_residuals(solver: Any) -> bool:
+    """Whether a solver works on 0 = F(t, y, ẏ) in place of an ODE."""
+    return isinstance(solver, AbstractResidualSolver)
+
+
+def counts(solver: Any) -> tuple[str, ...]:
+    """Which entries of the solver's state at the end of a solve are counts for `stats`."""
+    return getattr(solver, "counts", ())
