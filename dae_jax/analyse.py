@@ -14,7 +14,7 @@ from .equations.derivative_orders import Offsets, Slopes, find_offsets
 from .equations.residual_form import ResidualForm
 from .equations.taylor import total_derivatives
 from .structure import Block, block_triangular, pantelides
-from .systems import ConstrainedSystem, System
+from .systems import System, is_mechanism
 from .validate.states import counted, refuse_wrong_state
 from .validate.user_functions import refuse_wrong_functions
 
@@ -83,7 +83,7 @@ class Structure:
     @property
     def mechanical_degrees_of_freedom(self) -> int | None:
         """Coordinates minus constraints, for a `ConstrainedSystem`; `None` for other systems."""
-        if not isinstance(self.form.system, ConstrainedSystem):
+        if not is_mechanism(self.form.system):
             return None
         return self.form.layout.size // 2 - self.form.extra
 

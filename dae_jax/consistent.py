@@ -16,7 +16,7 @@ from .equations.regularity import has_rank, is_near_constraints, mass_is_regular
 from .equations.residual_form import ResidualForm
 from .equations.structural_ode import StructuralODE
 from .linalg import fixed_point, implicit_root, relative_change
-from .systems import ConstrainedSystem, System
+from .systems import ConstrainedSystem, System, is_mechanism
 from .validate.states import broadcast_to_state, refuse_wrong_state, with_rates
 from .validate.user_functions import refuse_wrong_functions
 
@@ -115,7 +115,7 @@ def look_at_start(
     all are independent), 3: the masses, 4: several ẏ satisfy the equations; and whether nothing is wrong beyond doubt.
     `invertible`: whether M must be.
     """
-    if not isinstance(system, ConstrainedSystem):
+    if not is_mechanism(system):
         left = unsolved(system, t, state, args)
         consistent = left.consistent()
         return jnp.where(consistent, jnp.where(left.several, 4, 0), 1), consistent & ~left.several
@@ -145,7 +145,7 @@ def look_at_end(
 ) -> End:  # fmt: skip
     """The state (t, y) at the `end` of a solve."""
     yes = jnp.asarray(True)
-    if not isinstance(system, ConstrainedSystem):
+    if not is_mechanism(system):
         return End(yes, ~yes, yes, yes)
     ode = MechanicalODE.of(system, t0, start, args, rank)
     start, (t, end) = ode.encode(start), (end[0], ode.encode(end[1]))
@@ -189,7 +189,7 @@ def consistent_state(
     if rates is not None:
         rates = broadcast_to_state("rates", rates, y0, "numbers")
         rates = jax.tree.map(lambda r, x: r.astype(x.dtype), rates, y0)
-    if isinstance(system, ConstrainedSystem) and rates is None:
+    if is_mechanism(system) and rates is None:
         found, fine, remains = _nearest_of_mechanism(system, t0, y0, args, masks)
     else:
         found, fine, remains = _nearest_of_any(system, t0, y0, args, masks, rates)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from .equations.mechanical import MechanicalODE
 from .equations.residual_drift import EquationDrift, equation_drift
 from .solution import DAESolution, without_padding
-from .systems import ConstrainedSystem, System
+from .systems import ConstrainedSystem, System, is_mechanism
 from .validate.states import brief, refuse_wrong_state, refuse_wrong_system
 from .validate.user_functions import refuse_no_real_number, refuse_wrong_functions, returned
 
@@ -42,7 +42,7 @@ def drift(system: System, sol: DAESolution) -> Drift | EquationDrift:
     Errors: `ValueError` for a solution without saved states.
     """
     refuse_wrong_system(system)
-    if not isinstance(system, ConstrainedSystem):
+    if not is_mechanism(system):
         return EquationDrift(_at_saved_times(system, sol, lambda t, y, args: equation_drift(system, t, y, args)))
 
     def largest(t: Any, y: Any, args: Any) -> tuple[Any, Any]:
@@ -93,7 +93,7 @@ def multipliers(system: ConstrainedSystem, *at: Any) -> Any:
     point that is concrete has none.
     """
     refuse_wrong_system(system)
-    if not isinstance(system, ConstrainedSystem):
+    if not is_mechanism(system):
         raise ValueError(
             f"`multipliers` takes a ConstrainedSystem; those of this {type(system).__name__} are among its unknowns, in `sol.ys`."
         )

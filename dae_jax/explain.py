@@ -21,7 +21,7 @@ from .formulations import AbstractFormulation, DummyDerivatives, ReducedResidual
 from .linalg.semidefinite import LOOPED, UNROLLED
 from .solution import precision_of
 from .solve import prepared
-from .systems import ConstrainedSystem
+from .systems import is_mechanism
 from .validate.states import counted
 
 
@@ -189,7 +189,7 @@ def explain(
     if isinstance(solve.formulation, Residual):
         y, pencil = solve.formulation.encode(system, t0, y0, args)
         return _of_residual(pencil, t0, y, method, precision, enabled and not found, found)
-    if isinstance(solve.formulation, DummyDerivatives) or not isinstance(system, ConstrainedSystem):
+    if isinstance(solve.formulation, DummyDerivatives) or not is_mechanism(system):
         ode = StructuralODE.of(ResidualForm.of(system, t0, y0, args), t0.dtype)
         y = jax.eval_shape(ode.encode, t0, y0)
         return StructuralPlan(

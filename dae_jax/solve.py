@@ -25,7 +25,7 @@ from .formulations import (
 )
 from .solution import DAESolution
 from .solvers import SelectedResiduals, SelectedStates, takes_residuals
-from .systems import ConstrainedSystem, System
+from .systems import System, is_mechanism
 from .validate.states import with_rates
 from .validate.user_functions import not_finite, refuse_wrong_functions
 
@@ -130,7 +130,7 @@ def prepared(
 
 def _for_residuals(system: Any, t0: Any, y0: Any, args: Any, solver: Any) -> AbstractFormulation:
     """The equations as they are written where the solver controls all their variables."""
-    if isinstance(system, ConstrainedSystem):
+    if is_mechanism(system):
         return Residual()
     reason = _why_not_as_written(system, t0, y0, args, Residual(), solver.default_index)
     return DummyDerivatives() if reason else Residual()

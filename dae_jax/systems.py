@@ -1,7 +1,8 @@
 """What the equations are: the systems that a user writes down as plain JAX functions."""
 
+import abc
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar, Literal, NamedTuple, TypeGuard
 
 import equinox as eqx
 import jax
@@ -10,7 +11,33 @@ import numpy as np
 from jaxtyping import Array, Float
 
 
-class ConstrainedSystem(eqx.Module):
+class Call(NamedTuple):
+    """A function of the user as it is to be called, `force(t, q, v, args)`, with these values; it `returns` what has the
+    structure of `like`, as many numbers as that, or a vector of any length. `of` is what `like` is called.
+    """
+
+    signature: str
+    function: Callable[..., Any]
+    values: tuple[Any, ...]
+    returns: Literal["structure", "count", "vector"]
+    like: Any = None
+    of: str = ""
+
+
+class AbstractSystem(eqx.Module):
+    """A system of equations. `parts` are the names of the parts of its state; where there is one the state is that, else the
+    tuple of them, which `pair` describes.
+    """
+
+    parts: eqx.AbstractClassVar[tuple[str, ...]]
+    pair: ClassVar[str] = ""
+
+    @abc.abstractmethod
+    def calls(self, t: Any, state: Any, args: Any) -> list[Call]:
+        """How the user's functions are called."""
+
+
+class ConstrainedSystem(AbstractSystem):
     """A constrained mechanical system in redundant coordinates,
 
         q̇ = v,
@@ -40,6 +67,9 @@ class ConstrainedSystem(eqx.Module):
     Source: E. Hairer, G. Wanner, *Solving Ordinary Differential Equations II*, eq. VII.1.46.
     """
 
+    parts: ClassVar[tuple[str, ...]] = ("q", "v")
+    pair: ClassVar[str] = "(q, v) of positions and velocities"
+
     force: Callable[..., Any]
     constraint: Callable[..., Any] | None = None
     mass: Any = None
@@ -62,6 +92,15 @@ class ConstrainedSystem(eqx.Module):
                 f"of all), or None for all of them, but is {self.rank!r}."
             )
 
+    def calls(self, t: Any, state: Any, args: Any) -> list[Call]:
+        q, v = state
+        found = [Call("force(t, q, v, args)", self.force, (t, q, v, args), "structure", q, "q")]
+        if self.constraint is not None:
+            found.append(Call("constraint(t, q, args)", self.constraint, (t, q, args), "vector"))
+        if self.nonholonomic is not None:
+            found.append(Call("nonholonomic(t, q, v, args)", self.nonholonomic, (t, q, v, args), "vector"))
+        return found
+
     def mass_matrix(self, q: Any, args: Any = None) -> Float[Array, "n n"] | Float[Array, " n"] | None:
         """M at `q`: `None` for unit masses, a vector if diagonal, else a matrix."""
         mass = self.mass(q, args) if callable(self.mass) else self.mass
@@ -72,7 +111,7 @@ class ConstrainedSystem(eqx.Module):
         return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(mass)])
 
 
-class SemiExplicitDAE(eqx.Module):
+class SemiExplicitDAE(AbstractSystem):
     """A semi-explicit system,
 
         ẋ = f(t, x, z),
@@ -90,14 +129,24 @@ class SemiExplicitDAE(eqx.Module):
     Differential-Algebraic Equations*, eq. 9.2.
     """
 
+    parts: ClassVar[tuple[str, ...]] = ("x", "z")
+    pair: ClassVar[str] = "(x, z) of a SemiExplicitDAE"
+
     f: Callable[..., Any]
     g: Callable[..., Any]
 
     def __check_init__(self) -> None:
         _require_functions(self, "f", "g")
 
+    def calls(self, t: Any, state: Any, args: Any) -> list[Call]:
+        x, z = state
+        return [
+            Call("f(t, x, z, args)", self.f, (t, x, z, args), "structure", x, "x"),
+            Call("g(t, x, z, args)", self.g, (t, x, z, args), "count", z, "z"),
+        ]
 
-class ImplicitDAE(eqx.Module):
+
+class ImplicitDAE(AbstractSystem):
     """A fully implicit system, 0 = F(t, y, ẏ), of any index. The state y is any pytree of arrays.
 
     **Arguments**
@@ -109,14 +158,30 @@ class ImplicitDAE(eqx.Module):
     Differential-Algebraic Equations*, eq. 1.1.1.
     """
 
+    parts: ClassVar[tuple[str, ...]] = ("y",)
+
     residual: Callable[..., Any]
     yd0: Any = None
 
     def __check_init__(self) -> None:
         _require_functions(self, "residual")
 
+    def calls(self, t: Any, state: Any, args: Any) -> list[Call]:
+        rates = jax.tree.map(lambda x: np.zeros(jnp.shape(x), jnp.result_type(x)), state)
+        return [Call("residual(t, y, yd, args)", self.residual, (t, state, rates, args), "count", state, "y")]
+
 
 System = ConstrainedSystem | SemiExplicitDAE | ImplicitDAE
+
+
+def is_mechanism(system: Any) -> TypeGuard[ConstrainedSystem]:
+    """Whether a system has masses, forces and constraints, from which its underlying ODE is found fastest."""
+    return isinstance(system, ConstrainedSystem)
+
+
+def is_implicit(system: Any) -> TypeGuard[ImplicitDAE]:
+    """Whether ẏ may occur in the equations in any way."""
+    return isinstance(system, ImplicitDAE)
 
 
 def _require_functions(system: eqx.Module, *names: str) -> None:

@@ -25,7 +25,7 @@ from ..solvers import (
     TangentSpace,
     Trapezoid,
 )
-from ..systems import ConstrainedSystem
+from ..systems import is_mechanism
 
 
 # The work-precision picture: tolerances, or steps, as factors of those of the table. A method that takes longer than so
@@ -49,7 +49,7 @@ def methods(scene: Scene) -> dict[str, Method]:
     """The methods by their command-line names that apply: the state-space form where the scene has a chart, explicit ones
     where it is not stiff.
     """
-    if not isinstance(scene.system, ConstrainedSystem):
+    if not is_mechanism(scene.system):
         implicit = {"radau": Method(RadauIIA5()), "bdf": Method(BDF())}
         if scene.stiff:
             return implicit
@@ -130,7 +130,7 @@ def measure(scene: Scene, name: str, method: Method, times: np.ndarray, rtol: fl
     median = float(np.median(seconds[1:]))
     row = Row(name, int(sol.stats["num_steps"]), median, seconds[0] - median, scene.error(times, sol.ys))
     system = scene.system
-    if not isinstance(system, ConstrainedSystem):
+    if not is_mechanism(system):
         return row, sol
     off = drift(system, sol)
     row = dataclasses.replace(row, velocity_drift=float(off.velocity.max()))

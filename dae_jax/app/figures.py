@@ -16,7 +16,7 @@ from ..diagnostics import drift, energy
 from ..formulations import Baumgarte, StateSpace
 from ..scenes import Scene
 from ..solvers import DOP853, OrthogonalProjection, SymmetricProjection, Trapezoid
-from ..systems import ConstrainedSystem, ImplicitDAE
+from ..systems import ConstrainedSystem, is_mechanism
 from . import plotting
 from .compare import Effort, Method, Row, solve
 
@@ -60,7 +60,7 @@ def figures(
         yield "work-precision", lambda: _work_precision(scene, efforts)
     if not solutions:
         return
-    if not isinstance(scene.system, ConstrainedSystem):
+    if not is_mechanism(scene.system):
         for name, sol in solutions.items():
             yield f"solution-{name}", functools.partial(_components, scene, name, sol)
         return
@@ -127,7 +127,7 @@ def _components(scene: Scene, name: str, sol: Any) -> Any:
 def _parts(scene: Scene, sol: Any) -> list[tuple[str, np.ndarray]]:
     """The leaves of a solution, by the letters of the documentation."""
     system = scene.system
-    letters = "y" if isinstance(system, ImplicitDAE) else "qv" if isinstance(system, ConstrainedSystem) else "xz"
+    letters = "".join(system.parts)
     return list(zip(letters, map(np.asarray, jax.tree.leaves(sol.ys)), strict=True))
 
 

@@ -21,10 +21,10 @@ def scene(parser: argparse.ArgumentParser, name: str, advice: str = "") -> Any:
 
 def mechanism(parser: argparse.ArgumentParser, name: str) -> Any:
     """The same, of a mechanism."""
-    from ..systems import ConstrainedSystem
+    from ..systems import is_mechanism
 
     found = scene(parser, name)
-    if not isinstance(found.system, ConstrainedSystem):
+    if not is_mechanism(found.system):
         parser.error(f"{name} is no mechanism: Baumgarte's parameters are for a ConstrainedSystem")
     return found
 

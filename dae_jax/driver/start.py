@@ -13,7 +13,7 @@ from ..equations.constraint_jacobian import Rank
 from ..equations.mechanical import MechanicalODE
 from ..equations.regularity import mass_is_regular, mass_message, rank_message, rank_of, redundancy
 from ..solution import RESULTS
-from ..systems import ConstrainedSystem, ImplicitDAE
+from ..systems import is_mechanism
 from ..validate.states import NUMBERS, brief, refuse_wrong_state
 from ..validate.user_functions import not_finite, time_axis_advice
 
@@ -42,7 +42,7 @@ def checked(system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any) -> tupl
         if (t1 - t0) * dt0 < 0:
             raise ValueError(f"`dt0` = {dt0} points away from `t1` = {t1}: it must have the sign of t1 − t0.")
     dtype = jnp.result_type(*jax.tree.leaves(y0))
-    y0 = jax.tree.map(lambda x: as_array(x, dtype), y0 if isinstance(system, ImplicitDAE) else tuple(y0))
+    y0 = jax.tree.map(lambda x: as_array(x, dtype), tuple(y0) if len(system.parts) > 1 else y0)
     return y0, jax.tree.map(lambda x: np.asarray(x, jnp.result_type(x)) if isinstance(x, float) else x, args)
 
 
@@ -83,7 +83,7 @@ def refuse_bad_start(system: Any, t0: Any, y0: Any, args: Any, invertible: bool)
     """Refuses an inconsistent or singular start in words; the rank of the constraints if some are redundant. `invertible`:
     whether the mass matrix must be.
     """
-    if not isinstance(system, ConstrainedSystem):
+    if not is_mechanism(system):
         left = _look_at_residual(system, t0, y0, args)
         if not bool(left.consistent()):
             raise ValueError(left.message() + _advice(system, t0, y0, args))

@@ -21,7 +21,7 @@ from ..structure import (
     sigma_method,
     signature,
 )
-from ..systems import ConstrainedSystem
+from ..systems import is_mechanism
 from .derivative_orders import Combination, Offsets, find_offsets
 from .index1_form import ReducedForm
 from .initial_rates import is_nonlinear, rates_of
@@ -193,7 +193,7 @@ class Pencil(eqx.Module):
         """Which of the user's variables are of index 2 and higher, those of a mechanism apart: its velocities follow from
         positions that are controlled.
         """
-        mechanism = isinstance(self.form, ResidualForm) and isinstance(self.form.system, ConstrainedSystem)
+        mechanism = isinstance(self.form, ResidualForm) and is_mechanism(self.form.system)
         return self.form.shown & (np.array(self.outline.indices) > 1) & (not mechanism)
 
     def counted(self, dense: bool) -> Bool[np.ndarray, " n"]:

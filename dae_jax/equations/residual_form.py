@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..linalg import row_products, solve
 from ..structure.layout import Layout
-from ..systems import ConstrainedSystem, ImplicitDAE, SemiExplicitDAE, System
+from ..systems import SemiExplicitDAE, System, is_implicit, is_mechanism
 from .manifold_ode import at_one_instant
 from .mechanical import MechanicalODE
 
@@ -46,7 +46,7 @@ class ResidualForm(eqx.Module):
     def of(cls, system: System, t: Any, state: Any, args: Any, form: Form = "index-3") -> "ResidualForm":
         """The residual of `system`; `state` gives shapes only."""
         layout = Layout.of(state)
-        if isinstance(system, ConstrainedSystem):
+        if is_mechanism(system):
             ode = MechanicalODE.of(system, t, state, args)
             names = ode.layout.names()
             rows = [f"constraint[{i}]" for i in range(ode.holonomic)]
@@ -84,15 +84,13 @@ class ResidualForm(eqx.Module):
     @property
     def may_cancel(self) -> bool:
         """Whether highest derivatives may cancel between equations: for a mechanism where constraints are redundant only."""
-        return not isinstance(self.system, ConstrainedSystem)
+        return not is_mechanism(self.system)
 
     @property
     def variables(self) -> tuple[str, ...]:
         """A name for each unknown."""
-        if isinstance(self.system, ImplicitDAE):
-            return tuple(f"y{n}" for n in self.layout.names())
-        letters = ("q", "v") if isinstance(self.system, ConstrainedSystem) else ("x", "z")
-        names = [letters[int(n[1])] + n[3:] for n in self.layout.names()]
+        parts, names = self.system.parts, self.layout.names()
+        names = [parts[0] + n for n in names] if len(parts) == 1 else [parts[int(n[1])] + n[3:] for n in names]
         multipliers = [f"multiplier[{i}]" for i in range(self.extra)]
         return (*names, *multipliers)
 
@@ -102,7 +100,7 @@ class ResidualForm(eqx.Module):
         The unit of a multiplier is the mass in the direction of its constraint, aᵀ M a / aᵀ a, over the length of a: then
         neither the unit of mass nor a factor of the constraint makes a difference.
         """
-        if not isinstance(self.system, ConstrainedSystem):
+        if not is_mechanism(self.system):
             return self, self.encode(state)
         ode = MechanicalODE.of(self.system, t, state, self.args)
         flat = ode.encode(state)
@@ -130,16 +128,16 @@ class ResidualForm(eqx.Module):
     @property
     def may_be_nonlinear(self) -> bool:
         """Whether ẏ may occur other than linearly."""
-        return isinstance(self.system, ImplicitDAE)
+        return is_implicit(self.system)
 
     @property
     def rates_are_given(self) -> bool:
         """Whether the user said what ẏ is near at the start."""
-        return isinstance(self.system, ImplicitDAE) and self.system.yd0 is not None
+        return is_implicit(self.system) and self.system.yd0 is not None
 
     def known_rates(self, y: Float[Array, " n"]) -> Float[Array, " n"]:
         """What is known of ẏ: what the user said of it, else nothing, 0."""
-        if isinstance(self.system, ImplicitDAE) and self.system.yd0 is not None:
+        if is_implicit(self.system) and self.system.yd0 is not None:
             return self.layout.flatten(self.system.yd0).astype(y.dtype)
         return jnp.zeros_like(y)
 
@@ -147,17 +145,17 @@ class ResidualForm(eqx.Module):
     def residual(self, t: Any, y: Float[Array, " n"], yd: Float[Array, " n"]) -> Float[Array, " n"]:
         """F(t, y, ẏ)."""
         system = self.system
-        if isinstance(system, ConstrainedSystem):
+        if is_mechanism(system):
             return self._mechanical(t, y, yd)
         state, rates = self.layout.unflatten(y), self.layout.unflatten(yd)
-        if isinstance(system, ImplicitDAE):
+        if is_implicit(system):
             return _flat(system.residual(t, state, rates, self.args), y.dtype)
         (x, z), (xd, _) = state, rates
         f = system.f(t, x, z, self.args)
         return jnp.concatenate([_flat(xd, y.dtype) - _flat(f, y.dtype), _flat(system.g(t, x, z, self.args), y.dtype)])
 
     def _mechanical(self, t: Any, y: Float[Array, " n"], yd: Float[Array, " n"]) -> Float[Array, " n"]:
-        assert isinstance(self.system, ConstrainedSystem)
+        assert is_mechanism(self.system)
         ode = MechanicalODE.of(self.system, t, self.layout.unflatten(y[: self.layout.size]), self.args)
         n, m, p = ode.layout.size, ode.holonomic, ode.nonholonomic
         q, v = y[:n], y[n : 2 * n]

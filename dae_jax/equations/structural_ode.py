@@ -23,7 +23,7 @@ from ..linalg import (
     tearing,
 )
 from ..structure import interpreted
-from ..systems import ConstrainedSystem
+from ..systems import is_mechanism
 from .derivative_orders import Combination, derivative_of, find_offsets
 from .initial_rates import is_nonlinear, rates_of
 from .manifold_ode import ManifoldODE, at_one_instant
@@ -377,7 +377,7 @@ def _pivots(a: Float[Array, "m N"]) -> tuple[Float[Array, "m N"], Float[Array, "
 
 def underlying_ode(system: Any, t: Any, state: Any, args: Any, rank: int | None = None) -> tuple[Any, ManifoldODE]:
     """The state and the underlying ODE of any system; a mechanism's is found faster than from the offsets."""
-    if isinstance(system, ConstrainedSystem):
+    if is_mechanism(system):
         mechanical = MechanicalODE.of(system, t, state, args, rank)
         return mechanical.encode(state), mechanical
     ode = StructuralODE.of(ResidualForm.of(system, t, state, args), jnp.result_type(*jax.tree.leaves(state)))

@@ -8,11 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..systems import ConstrainedSystem, ImplicitDAE, SemiExplicitDAE
+from ..systems import AbstractSystem, is_implicit, is_mechanism
 
 
 NUMBERS = (jax.Array, np.ndarray, np.generic, jax.ShapeDtypeStruct, float, int, complex, bool)
-SYSTEMS = (ConstrainedSystem, SemiExplicitDAE, ImplicitDAE)
 
 
 def brief(x: Any) -> str:
@@ -50,7 +49,7 @@ class _Shape:
 
 def refuse_wrong_system(system: Any) -> None:
     """Refuses what is none of the three systems."""
-    if not isinstance(system, SYSTEMS):
+    if not isinstance(system, AbstractSystem):
         kind = f"the class {system.__name__}" if isinstance(system, type) else f"a {type(system).__name__}"
         raise TypeError(f"`system` must be a dae_jax.ConstrainedSystem, SemiExplicitDAE or ImplicitDAE, but is {kind}.")
 
@@ -62,14 +61,10 @@ def refuse_wrong_state(system: Any, y0: Any, name: str = "y0") -> None:
         raise ValueError(
             f"`{name}` must be a state, but is a solution: go on from its last state with `{name}=sol.final`."
         )
-    if isinstance(system, ConstrainedSystem):
-        flat = isinstance(y0, jax.Array | np.ndarray) and np.ndim(y0) == 1 and np.size(y0) % 2 == 0
-        n = np.size(y0) // 2 if flat else 0
-        split = f"; if v is behind q in it, write `{name}=(y[:{n}], y[{n}:])`" if flat else ""
-        _refuse_no_pair(y0, name, "(q, v) of positions and velocities", split)
+    if len(system.parts) > 1:
+        _refuse_no_pair(y0, name, system.pair, _how_to_split(y0, name) if is_mechanism(system) else "")
+    if is_mechanism(system):
         _refuse_unlike(*y0, name)
-    elif isinstance(system, SemiExplicitDAE):
-        _refuse_no_pair(y0, name, "(x, z) of a SemiExplicitDAE")
     leaves = jax.tree.leaves(y0)
     if not leaves:
         raise ValueError(f"`{name}` must hold numbers, but is empty: {brief(y0)}.")
@@ -78,7 +73,14 @@ def refuse_wrong_state(system: Any, y0: Any, name: str = "y0") -> None:
             raise TypeError(f"`{name}` must hold arrays of floating-point numbers, but holds {brief(leaf)}.")
 
 
-def _refuse_no_pair(y0: Any, name: str, pair: str, advice: str = "") -> None:
+def _how_to_split(y0: Any, name: str) -> str:
+    """Advice for a vector in which v is behind q."""
+    flat = isinstance(y0, jax.Array | np.ndarray) and np.ndim(y0) == 1 and np.size(y0) % 2 == 0
+    n = np.size(y0) // 2 if flat else 0
+    return f"; if v is behind q in it, write `{name}=(y[:{n}], y[{n}:])`" if flat else ""
+
+
+def _refuse_no_pair(y0: Any, name: str, pair: str, advice: str) -> None:
     if not isinstance(y0, tuple | list) or len(y0) != 2:
         raise ValueError(f"`{name}` must be the pair {pair}, but is {brief(y0)}{advice}.")
 
@@ -114,7 +116,7 @@ def with_rates(system: Any, yd0: Any, state: Any) -> Any:
     """The system with `yd0`, ẏ near the start, where that is given; refuses one for a system that is explicit in ẏ."""
     if yd0 is None:
         return system
-    if not isinstance(system, ImplicitDAE):
+    if not is_implicit(system):
         raise ValueError(
             f"`yd0` is for an ImplicitDAE, whose equations may have several solutions ẏ; those of a "
             f"{type(system).__name__} give one."

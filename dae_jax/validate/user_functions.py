@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..systems import ConstrainedSystem, ImplicitDAE, SemiExplicitDAE, System
+from ..systems import ConstrainedSystem, System, is_mechanism
 from .states import NUMBERS, describe
 
 
@@ -54,22 +54,16 @@ def time_axis_advice(system: System, t: Any, state: Any, args: Any) -> str:
 
 
 def _refuse(system: System, t: Any, state: Any, args: Any) -> None:
-    if isinstance(system, ImplicitDAE):
-        found = returned("residual(t, y, yd, args)", system.residual, t, state, state, args)
-        return _as_many(found, "residual(t, y, yd, args)", state, "y")
-    if isinstance(system, SemiExplicitDAE):
-        x, z = state
-        _like(returned("f(t, x, z, args)", system.f, t, x, z, args), "f(t, x, z, args)", x, "x")
-        return _as_many(returned("g(t, x, z, args)", system.g, t, x, z, args), "g(t, x, z, args)", z, "z")
-    q, v = state
-    _like(returned("force(t, q, v, args)", system.force, t, q, v, args), "force(t, q, v, args)", q, "q")
-    if system.constraint is not None:
-        _is_vector(returned("constraint(t, q, args)", system.constraint, t, q, args), "constraint(t, q, args)")
-    if system.nonholonomic is not None:
-        call = "nonholonomic(t, q, v, args)"
-        _is_vector(returned(call, system.nonholonomic, t, q, v, args), call)
-    _check_mass(system, q, args)
-    return None
+    for call in system.calls(t, state, args):
+        found = returned(call.signature, call.function, *call.values)
+        if call.returns == "structure":
+            _like(found, call.signature, call.like, call.of)
+        elif call.returns == "count":
+            _as_many(found, call.signature, call.like, call.of)
+        else:
+            _is_vector(found, call.signature)
+    if is_mechanism(system):
+        _check_mass(system, state[0], args)
 
 
 def returned(call: str, function: Callable[..., Any], *values: Any) -> Any:
@@ -199,23 +193,12 @@ def _all_numbers(tree: Any) -> bool:
 
 def not_finite(system: System, t: Any, state: Any, args: Any) -> str:
     """Which of a system's functions are not finite at a state, in a sentence with what may be the reason; "" if all are."""
-    calls: dict[str, tuple[Any, tuple[Any, ...]]] = {}
-    if isinstance(system, ConstrainedSystem):
-        q, v = state
-        mass = system.mass if callable(system.mass) else lambda q, args: system.mass
-        calls = {
-            "force(t, q, v, args)": (system.force, (t, q, v, args)),
-            "constraint(t, q, args)": (system.constraint, (t, q, args)),
-            "nonholonomic(t, q, v, args)": (system.nonholonomic, (t, q, v, args)),
-            "mass(q, args)" if callable(system.mass) else "mass": (mass, (q, args)),
-        }
-    elif isinstance(system, SemiExplicitDAE):
-        x, z = state
-        calls = {"f(t, x, z, args)": (system.f, (t, x, z, args)), "g(t, x, z, args)": (system.g, (t, x, z, args))}
-    else:
-        rates = jax.tree.map(jnp.zeros_like, state)
-        calls = {"residual(t, y, yd, args)": (system.residual, (t, state, rates, args))}
-    bad = [call for call, (function, values) in calls.items() if function and not _all_finite(function(*values))]
+    calls = [(call.signature, call.function, call.values) for call in system.calls(t, state, args)]
+    if is_mechanism(system) and callable(system.mass):
+        calls.append(("mass(q, args)", system.mass, (state[0], args)))
+    elif is_mechanism(system):
+        calls.append(("mass", lambda: system.mass, ()))
+    bad = [call for call, function, values in calls if not _all_finite(function(*values))]
     if not bad:
         return ""
     reason = "; `args` holds NaN or infinity" if not _all_finite(args) else ""
