@@ -16,6 +16,7 @@ from jax.interpreters import batching, mlir
 from jax.interpreters.partial_eval import dce_jaxpr
 
 from . import lower, waiting, xla_kernel
+from .jaxprs.expansions import expanded
 from .jaxprs.scalar_interpreter import Unsupported
 from .jaxprs.unchecked import without_checks
 
@@ -40,7 +41,8 @@ def as_kernel(fn: Callable[..., Any]) -> Callable[..., Any]:
         jaxpr, out = known.get((treedef, shapes)) or _traced(fn, jax.tree.unflatten(treedef, shapes))
         if not any(isinstance(x, jax.core.Tracer) for x in jaxpr.consts):
             known[treedef, shapes] = jaxpr, out
-        return jax.tree.unflatten(out, called(jaxpr, leaves))
+        results = called(jaxpr, leaves)
+        return jax.tree.unflatten(out, jax.jit(jaxpr_as_fun(jaxpr))(*leaves) if results is None else results)
 
     return traced
 
@@ -53,16 +55,19 @@ def _traced(fn: Callable[..., Any], shapes: Any) -> tuple[ClosedJaxpr, Any]:
     return jaxpr, jax.tree.structure(out)
 
 
-def called(jaxpr: ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
-    """The results of a traced function, as one kernel where it can be one."""
+def called(jaxpr: ClosedJaxpr, args: Sequence[Any]) -> list[Any] | None:
+    """The results of a traced function as one kernel; `None` where it cannot be one."""
     # Tangents of integers are no numbers. XLA aborts where a parameter of a kernel is not used.
     outvars = jaxpr.jaxpr.outvars
     known = [v.aval.dtype != jax.dtypes.float0 for v in outvars]
     needed, used = dce_jaxpr(jaxpr.jaxpr, known)
-    kernel = ClosedJaxpr(needed, jaxpr.consts)
+    try:
+        kernel = expanded(ClosedJaxpr(needed, jaxpr.consts))
+    except Unsupported:
+        return None
     constants = [x for x in jaxpr.consts if isinstance(x, jax.core.Tracer)]
     if jaxpr.effects or constants or hindrances(kernel):
-        return jax.jit(jaxpr_as_fun(jaxpr))(*args)
+        return None
     numbers = iter(_bind(kernel, (), [x for x, u in zip(args, used, strict=True) if u]))
     return [
         next(numbers) if k else np.zeros(v.aval.shape, jax.dtypes.float0) for v, k in zip(outvars, known, strict=True)
