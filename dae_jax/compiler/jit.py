@@ -12,6 +12,7 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from .inspection import Lowered
 from .jaxprs.checks import checks_apart
+from .jaxprs.expansions import expanded
 from .jaxprs.scalar_interpreter import Unsupported
 from .kernel_call import called
 from .linear_map import Arrays, derivative_map, is_inexact
@@ -59,7 +60,7 @@ class Jitted:
             flat, arrays, _ = _of_arrays(self._fn, args, kwargs)
             jaxpr = jax.make_jaxpr(flat)(*arrays)
             try:
-                kernel, _ = checks_apart(jaxpr)
+                kernel, _ = checks_apart(expanded(jaxpr))
                 found.append(Lowered.of(jaxpr, kernel))
             except Unsupported as error:
                 found.append(Lowered(jaxpr, jaxpr, "xla", (str(error),)))
@@ -139,7 +140,7 @@ def _kernel(fn: Callable[..., Arrays]) -> Callable[..., Arrays]:
         with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
             jaxpr = jax.make_jaxpr(lambda *xs: fn(*jax.tree.unflatten(treedef, xs)))(*leaves)
             try:
-                kernel, messages = checks_apart(jaxpr)
+                kernel, messages = checks_apart(expanded(jaxpr))
                 results = called(kernel, leaves)
             except Unsupported:
                 results = None

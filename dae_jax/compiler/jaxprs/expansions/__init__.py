@@ -14,6 +14,7 @@ from ..rewriting import Rewriting
 from ..walk import equations
 from .factorisations import cholesky, lu, lu_pivots_to_permutation
 from .orthogonal import geqrf, householder_product, qr
+from .sorting import sort
 from .triangular import triangular_solve
 
 
@@ -24,6 +25,7 @@ EXPANSIONS: dict[str, Callable[..., Any]] = {
     "lu": lu,
     "lu_pivots_to_permutation": lu_pivots_to_permutation,
     "qr": qr,
+    "sort": sort,
     "triangular_solve": triangular_solve,
 }
 # lineax's: what it does shows where it is evaluated.
