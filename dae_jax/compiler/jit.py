@@ -16,6 +16,7 @@ from .jaxprs.expansions import expanded
 from .jaxprs.scalar_interpreter import Unsupported
 from .kernel_call import called
 from .linear_map import Arrays, derivative_map, is_inexact
+from .settings import one_kernel_enabled
 
 
 def jit(
@@ -60,10 +61,9 @@ class Jitted:
             flat, arrays, _ = _of_arrays(self._fn, args, kwargs)
             jaxpr = jax.make_jaxpr(flat)(*arrays)
             try:
-                kernel, _ = checks_apart(expanded(jaxpr))
-                found.append(Lowered.of(jaxpr, kernel))
-            except Unsupported as error:
-                found.append(Lowered(jaxpr, jaxpr, "xla", (str(error),)))
+                found.append(Lowered.of(jaxpr, *checks_apart(expanded(jaxpr))))
+            except Unsupported as reason:
+                found.append(Lowered(jaxpr, jaxpr, "xla", (reason,)))
 
         jax.jit(self._like_fn(look), **self._statics).trace(*args, **kwargs)
         return found[0]
@@ -76,7 +76,7 @@ class Jitted:
         return self if instance is None else functools.partial(self, instance)
 
     def _traced(self, *args: Any, **kwargs: Any) -> Any:
-        if jax.default_backend() != "cpu":
+        if not one_kernel_enabled() or jax.default_backend() != "cpu":
             return self._fn(*args, **kwargs)
         flat, arrays, tree = _of_arrays(self._fn, args, kwargs)
         jaxpr = jax.make_jaxpr(flat)(*arrays)

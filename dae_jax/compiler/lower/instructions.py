@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from ..emit.machine import has_symbol, vector_function, vector_size
+from ..emit.target import vector_size
+from ..emit.vector_math import has_symbol, vector_function
 from ..jaxprs.scalar_interpreter import Unsupported
 
 

@@ -9,7 +9,10 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 
-from ..emit import machine
+from ..emit import available, register
+from ..emit.interface import batch_size, buffer
+from ..emit.runtime import alone, heap, in_threads
+from ..emit.target import vector_size
 from ..jaxprs.inline import inlined
 from ..jaxprs.numbers import on_numbers
 from ..jaxprs.scalar_interpreter import Unsupported
@@ -30,8 +33,6 @@ AT_MOST = 4
 HEAP = 2**30
 # Loops over this many entries use the machine's longest vectors: a chain of 64 pendulums gains 15 %, arrays of ten lose 25 %.
 LONG = 256
-# Fewer vectors than these are not worth the 20 µs that it takes to start a thread.
-VECTORS = 4
 
 
 def hindrances(jaxpr: ClosedJaxpr) -> tuple[str, ...]:
@@ -42,7 +43,7 @@ def hindrances(jaxpr: ClosedJaxpr) -> tuple[str, ...]:
         if eqn.effects or not (eqn.primitive.name in KNOWN or _is_number(eqn)) or not all(map(_has_kind, avals)):
             found.append(eqn.primitive.name)
     arguments = [v.aval.size > SMALL for v in jaxpr.jaxpr.invars]
-    if not found and (not machine.available() or _is_too_large(jaxpr, extent(jaxpr, arguments)[0])):
+    if not found and (not available() or _is_too_large(jaxpr, extent(jaxpr, arguments)[0])):
         found.append("size")
     return tuple(dict.fromkeys(found))
 
@@ -86,7 +87,7 @@ def written(jaxpr: ClosedJaxpr, batched: tuple[bool, ...] = (), always_copies: b
 class _Module:
     def __init__(self, jaxpr: ClosedJaxpr, batched: Sequence[bool], always_copies: bool) -> None:
         self.jaxpr, self.batched = jaxpr, list(batched) or [False] * len(jaxpr.jaxpr.invars)
-        self.code = Memory(machine.vector_size() if any(batched) else 1, always_copies)
+        self.code = Memory(vector_size() if any(batched) else 1, always_copies)
         self.run = Control(self.code, LIMIT)
 
     def text(self, place: int | None) -> str:
@@ -98,29 +99,25 @@ class _Module:
             self._batch(place)
         else:
             self._store(self.run.run(self.jaxpr, self._arguments(None)), None, None)
-        found = [line for k in range(len(ins)) for line in machine.buffer("%args", k, f"arg{k}")]
-        found += [line for k in range(len(outs)) for line in machine.buffer("%results", k, f"result{k}")]
+        found = [line for k in range(len(ins)) for line in buffer("%args", k, f"arg{k}")]
+        found += [line for k in range(len(outs)) for line in buffer("%results", k, f"result{k}")]
         if code.heap > HEAP:
             raise Unsupported("arrays that are too large")
         if code.heap:
             code.function("malloc", "ptr", "i64")
             code.function("free", "void", "ptr")
-            found += [
-                f"%heap.raw = call ptr @malloc(i64 {code.heap + 64})",
-                "%heap.int = ptrtoint ptr %heap.raw to i64",
-                "%heap.up = add i64 %heap.int, 63",
-                "%heap.aligned = and i64 %heap.up, -64",
-                "%heap = inttoptr i64 %heap.aligned to ptr",
-            ]
-            code.lines.append("call void @free(ptr %heap.raw)")
+            taken, given_back = heap(code.heap)
+            found += taken
+            code.lines += given_back
         body = [*found, *code.stack, "br label %start", "start:", *code.lines]
-        enough = VECTORS * code.width
         functions = (
-            machine.in_threads(body, self.batched.index(True), enough)
-            if lanes
-            else machine.alone(body, code.longest >= LONG)
+            in_threads(body, self._find_batch(), code.width) if lanes else alone(body, code.longest >= LONG)
         )
         return "\n".join([*code.constants, *code.declared.values(), *functions])
+
+    def _find_batch(self) -> list[str]:
+        first = self.batched.index(True)
+        return [*buffer("%args", first, f"arg{first}"), *batch_size(f"arg{first}")]
 
     def _arguments(self, row: Value | None) -> list[Any]:
         """The arguments, of the element that each lane has."""
@@ -154,7 +151,7 @@ class _Module:
         code, width = self.code, self.code.width
         size, last = Value("%batch", "i64"), Value("%batch.last", "i64")
         code.stack += [
-            *machine.batch_size(f"arg{self.batched.index(True)}"),
+            *batch_size(f"arg{self.batched.index(True)}"),
             f"{last.name} = sub i64 {size.name}, 1",
         ]
         if place is not None:
@@ -182,7 +179,7 @@ def compiled(
     jaxpr: ClosedJaxpr, batched: Sequence[bool] = (), always_copies: bool = False
 ) -> Callable[..., list[Any]]:
     """The function as one that JAX calls; arguments and results as `written` has them."""
-    name = machine.register(written(jaxpr, tuple(batched), always_copies))
+    name = register(written(jaxpr, tuple(batched), always_copies), jaxpr)
     first = list(batched).index(True) if any(batched) else None
 
     def call(*xs: Any) -> list[Any]:
@@ -191,3 +188,13 @@ def compiled(
         return list(jax.ffi.ffi_call(name, structs)(*xs))
 
     return call
+
+
+def unsupported(jaxpr: ClosedJaxpr, batched: tuple[bool, ...] = ()) -> tuple[Unsupported, ...]:
+    names = hindrances(jaxpr)
+    if not names and batched:
+        try:
+            written(jaxpr, batched)
+        except Unsupported as e:
+            return (e,)
+    return tuple(Unsupported(n) for n in names)
