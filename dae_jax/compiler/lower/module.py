@@ -188,13 +188,3 @@ def compiled(
         return list(jax.ffi.ffi_call(name, structs)(*xs))
 
     return call
-
-
-def unsupported(jaxpr: ClosedJaxpr, batched: tuple[bool, ...] = ()) -> tuple[Unsupported, ...]:
-    names = hindrances(jaxpr)
-    if not names and batched:
-        try:
-            written(jaxpr, batched)
-        except Unsupported as e:
-            return (e,)
-    return tuple(Unsupported(n) for n in names)
