@@ -70,5 +70,6 @@ class Lowered:
         batch = ", a batch as lanes of vectors" if any(self.lanes) else ""
         lines = [f"{_WORDS[self.compiler]}{batch}: {count} equations"]
         lines += [f"  not taken by our compiler: {reason}" for reason in self.unsupported]
-        lines += [f"  checked when it is done: {message.splitlines()[0]}" for message in self.checks]
+        if self.checks:
+            lines.append("  what is checked raises when it is done: see `checks`")
         return "\n".join(lines)
