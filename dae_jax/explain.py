@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .compiler import equations, hindrances, one_kernel_enabled, without_checks
+from .compiler import Decision, decision, equations, one_kernel_enabled, without_checks
 from .driver.program import Solve
 from .driver.start import refuse_bad_start, refuse_no_time
 from .equations.constraint_jacobian import SparseNormals
@@ -17,12 +17,16 @@ from .equations.linearised import Pencil
 from .equations.mechanical import MechanicalODE
 from .equations.residual_form import ResidualForm
 from .equations.structural_ode import StructuralODE
-from .formulations import AbstractFormulation, DummyDerivatives, ReducedResidual, Residual
+from .formulations import AbstractFormulation
 from .linalg.semidefinite import LOOPED, UNROLLED
 from .solution import precision_of
 from .solve import prepared
+from .solvers import takes_residuals
 from .systems import is_mechanism
 from .validate.states import counted
+
+
+_COMPILERS = {"llvm": "yes, by our compiler (LLVM)", "xla kernel": "yes, by XLA", "xla": "no, XLA as it is"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,7 +37,10 @@ class Plan:
     - `precision`: the numbers' type, and the tolerances.
     - `linear_solver`: how the linear systems of a step are solved.
     - `operations`: primitive operations of one evaluation of the field or the residual, as it is compiled.
-    - `one_kernel`: whether the whole loop is compiled to one kernel; `hindrances`: the primitives that prevent it.
+    - `one_kernel`: whether the whole loop is compiled to one kernel.
+    - `compiler`: who compiles it: "llvm", our compiler, as one kernel; "xla kernel", XLA as one kernel; "xla", XLA as many.
+      `batch_compiler`: the same of a batch of starts under `vmap`; "xla" where XLA does it, in whatever form.
+    - `reasons`: what our compiler does not take, with the equation; `hindrances`: the primitives of these equations.
     - `left_out`: what other systems need and this one does not.
     """
 
@@ -41,17 +48,25 @@ class Plan:
     precision: str
     linear_solver: str
     operations: int
-    one_kernel: bool
+    compiler: str
+    batch_compiler: str
+    reasons: tuple[str, ...]
     hindrances: tuple[str, ...]
     left_out: tuple[str, ...]
 
+    @property
+    def one_kernel(self) -> bool:
+        return self.compiler != "xla"
+
     def __str__(self) -> str:
-        kernel = "yes" if self.one_kernel else "no: " + (", ".join(self.hindrances) or "switched off, or not on a CPU")
+        why = "".join(f"; {reason}" for reason in self.reasons)
+        batch = "lanes of vectors" if self.batch_compiler == "llvm" else "left to XLA"
         rows = {
             "method": self.method,
             "precision": self.precision,
             **self._found(),
-            "one kernel": kernel,
+            "one kernel": _COMPILERS[self.compiler] + why,
+            "batch": batch,
             "left out": "; ".join(self.left_out) or "nothing",
         }
         return "\n".join(f"{name:>20}  {text}" for name, text in rows.items())
@@ -182,14 +197,14 @@ def explain(
     solve.refuse_wrong_functions(problem)
     precision = precision_of(t0.dtype, solve.controller)
     kernel, arrays = solve.kernel(dataclasses.replace(problem, rank=rank))
-    found = hindrances(jax.make_jaxpr(without_checks(kernel))(arrays))
-    enabled = one_kernel_enabled() and jax.default_backend() == "cpu" and solve.derivative() != "any"
-    reduced = isinstance(solve.formulation, ReducedResidual)
-    method = f"{_name(formulation or (DummyDerivatives() if reduced else solve.formulation))}, {_name(solver)}"
-    if isinstance(solve.formulation, Residual):
+    starts = jax.tree.leaves(y0)
+    jaxpr = jax.make_jaxpr(without_checks(kernel))(arrays)
+    compiled = _compiled(solve, jaxpr, [any(x is start for start in starts) for x in arrays])
+    method = f"{(formulation or solve.formulation).name}, {_name(solver)}"
+    if takes_residuals(solve.solver):
         y, pencil = solve.formulation.encode(system, t0, y0, args)
-        return _of_residual(pencil, t0, y, method, precision, enabled and not found, found)
-    if isinstance(solve.formulation, DummyDerivatives) or not is_mechanism(system):
+        return _of_residual(pencil, t0, y, method, precision, compiled)
+    if solve.formulation.selects_states or not is_mechanism(system):
         ode = StructuralODE.of(ResidualForm.of(system, t0, y0, args), t0.dtype)
         y = jax.eval_shape(ode.encode, t0, y0)
         return StructuralPlan(
@@ -197,8 +212,7 @@ def explain(
             precision=precision,
             linear_solver=ode.tearing.describe(ode.form.size),
             operations=_operations(lambda y: ode.field(t0, y), y),
-            one_kernel=enabled and not found,
-            hindrances=found,
+            **compiled,
             left_out=() if solve.between() else ("dense output",),
             unknowns=ode.form.size,
             state=ode.orders.size,
@@ -214,8 +228,7 @@ def explain(
         precision=precision,
         linear_solver=_linear_solver(ode, count),
         operations=_operations(lambda y: ode.field(t0, y), y),
-        one_kernel=enabled and not found,
-        hindrances=found,
+        **compiled,
         left_out=tuple(_left_out(ode, solve)),
         coordinates=ode.layout.size,
         constraints=count,
@@ -227,8 +240,22 @@ def explain(
     )
 
 
+def _compiled(solve: Solve, jaxpr: Any, starts: list[bool]) -> dict[str, Any]:
+    """Who compiles a solve's loop, and why; `starts`: which of its arguments a batch of starts has lanes of."""
+    off = "off: derivatives through the loop, a progress meter, a switch, or no CPU"
+    if not one_kernel_enabled() or jax.default_backend() != "cpu" or solve.derivative() == "any":
+        return {"compiler": "xla", "batch_compiler": "xla", "reasons": (off,), "hindrances": ()}
+    alone, batch = decision(jaxpr), decision(jaxpr, starts) if any(starts) else Decision("xla", ())
+    return {
+        "compiler": alone.compiler,
+        "batch_compiler": "llvm" if batch.compiler == "llvm" else "xla",
+        "reasons": tuple(dict.fromkeys(map(str, (*alone.unsupported, *batch.unsupported)))),
+        "hindrances": tuple(dict.fromkeys(found.primitive for found in alone.unsupported)),
+    }
+
+
 def _of_residual(
-    pencil: Pencil, t0: Any, y: Any, method: str, precision: str, one_kernel: bool, found: tuple[str, ...]
+    pencil: Pencil, t0: Any, y: Any, method: str, precision: str, compiled: dict[str, Any]
 ) -> ResidualPlan:
     outline, n = pencil.outline, y.size
     colours = tuple(n if c is None else len(c.seeds) for c in (outline.by_y, outline.by_rate))
@@ -237,8 +264,7 @@ def _of_residual(
         precision=precision,
         linear_solver=outline.storage.describe(),
         operations=_operations(lambda y: pencil.residual(t0, y, y), y),
-        one_kernel=one_kernel,
-        hindrances=found,
+        **compiled,
         left_out=("directional derivatives of structural zeros",) if sum(colours) < 2 * n else (),
         unknowns=n,
         indices=outline.indices,

@@ -4,6 +4,7 @@ What the kernel is made with is decided when the program that calls it is compil
 our own compiler where it can, else XLA's single kernels, else XLA as it is. A batch becomes lanes of vectors.
 """
 
+import dataclasses
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -13,21 +14,58 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import batching, mlir
-from jax.interpreters.partial_eval import dce_jaxpr
 
-from . import lower, waiting, xla_kernel
+from . import fallbacks, lower, waiting, xla_kernel
+from ._compat import dce_jaxpr
+from .check import checked
+from .jaxprs.expansions import expanded
 from .jaxprs.scalar_interpreter import Unsupported
 from .jaxprs.unchecked import without_checks
+from .settings import current
 
 
 kernel_p = Primitive("one_kernel")
 kernel_p.multiple_results = True
 
 
-def hindrances(jaxpr: ClosedJaxpr) -> tuple[str, ...]:
-    """The names of the primitives in `jaxpr`, at any depth, that keep it from being one kernel; empty if none does."""
-    found = lower.hindrances(jaxpr)
-    return found if found == () else xla_kernel.hindrances(jaxpr)
+@dataclasses.dataclass(frozen=True)
+class Decision:
+    """Who compiles a function, and what our compiler does not take of it.
+
+    `compiler`: "llvm", our compiler, as one kernel; "xla kernel", XLA as one kernel; "xla", XLA as many.
+    """
+
+    compiler: str
+    unsupported: tuple[Unsupported, ...]
+
+
+def decision(jaxpr: ClosedJaxpr, lanes: Sequence[bool] = ()) -> Decision:
+    """The decision of `called`; `lanes`: of a batch, in which these arguments have a leading axis."""
+    try:
+        kernel, used = _needed(jaxpr)
+    except Unsupported as reason:
+        return Decision("xla", (reason,))
+    return _decided(kernel, tuple(b for b, u in zip(lanes, used, strict=True) if u) if lanes else ())
+
+
+def _decided(kernel: ClosedJaxpr, lanes: tuple[bool, ...]) -> Decision:
+    if current().compiler != "llvm":
+        found = (Unsupported(f"our compiler is switched off: `compiler={current().compiler!r}`"),)
+    else:
+        found = lower.unsupported(kernel, lanes)
+    if not found:
+        return Decision("llvm", ())
+    # Which form of a batch XLA takes depends on its size.
+    by_xla = current().compiler != "off" and not xla_kernel.hindrances(kernel)
+    return Decision("xla kernel" if by_xla else "xla", found)
+
+
+def _needed(jaxpr: ClosedJaxpr) -> tuple[ClosedJaxpr, list[bool]]:
+    """A function as it is compiled to a kernel, and which of its arguments that has."""
+    # Tangents of integers are no numbers. XLA aborts where a parameter of a kernel is not used.
+    known = [v.aval.dtype != jax.dtypes.float0 for v in jaxpr.jaxpr.outvars]
+    needed, used = dce_jaxpr(jaxpr.jaxpr, known)
+    return expanded(ClosedJaxpr(needed, jaxpr.consts)), used
 
 
 def as_kernel(fn: Callable[..., Any]) -> Callable[..., Any]:
@@ -40,7 +78,8 @@ def as_kernel(fn: Callable[..., Any]) -> Callable[..., Any]:
         jaxpr, out = known.get((treedef, shapes)) or _traced(fn, jax.tree.unflatten(treedef, shapes))
         if not any(isinstance(x, jax.core.Tracer) for x in jaxpr.consts):
             known[treedef, shapes] = jaxpr, out
-        return jax.tree.unflatten(out, called(jaxpr, leaves))
+        results = called(jaxpr, leaves)
+        return jax.tree.unflatten(out, jax.jit(jaxpr_as_fun(jaxpr))(*leaves) if results is None else results)
 
     return traced
 
@@ -53,16 +92,18 @@ def _traced(fn: Callable[..., Any], shapes: Any) -> tuple[ClosedJaxpr, Any]:
     return jaxpr, jax.tree.structure(out)
 
 
-def called(jaxpr: ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
-    """The results of a traced function, as one kernel where it can be one."""
-    # Tangents of integers are no numbers. XLA aborts where a parameter of a kernel is not used.
+def called(jaxpr: ClosedJaxpr, args: Sequence[Any]) -> list[Any] | None:
+    """The results of a traced function as one kernel; `None` where it cannot be one."""
     outvars = jaxpr.jaxpr.outvars
     known = [v.aval.dtype != jax.dtypes.float0 for v in outvars]
-    needed, used = dce_jaxpr(jaxpr.jaxpr, known)
-    kernel = ClosedJaxpr(needed, jaxpr.consts)
-    constants = [x for x in jaxpr.consts if isinstance(x, jax.core.Tracer)]
-    if jaxpr.effects or constants or hindrances(kernel):
-        return jax.jit(jaxpr_as_fun(jaxpr))(*args)
+    if jaxpr.effects or any(isinstance(x, jax.core.Tracer) for x in jaxpr.consts):
+        return None
+    try:
+        kernel, used = _needed(jaxpr)
+    except Unsupported:
+        return None
+    if _decided(kernel, ()).compiler == "xla":
+        return None
     numbers = iter(_bind(kernel, (), [x for x, u in zip(args, used, strict=True) if u]))
     return [
         next(numbers) if k else np.zeros(v.aval.shape, jax.dtypes.float0) for v, k in zip(outvars, known, strict=True)
@@ -94,14 +135,25 @@ def _lower(*args: Any, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> list[Any]
 
 
 def _lowered(args: Any, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> list[Any]:
-    if not lower.hindrances(jaxpr):
-        try:
-            return lower.compiled(jaxpr, lanes)(*args)
-        except Unsupported:
-            pass
-        except Exception as error:  # XLA can still do it
-            warnings.warn(f"A kernel is left to XLA, please report it: {error!r}", RuntimeWarning, stacklevel=2)
-    return _by_xla(jaxpr, lanes, args)
+    ours = _by_llvm(jaxpr, lanes, args)
+    if ours is None:
+        return _by_xla(jaxpr, lanes, args)
+    if current().check:
+        return checked(ours, jax.jit(lambda *xs: _plain(*xs, jaxpr=jaxpr, lanes=lanes))(*args), current().check)
+    return ours
+
+
+def _by_llvm(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Any) -> list[Any] | None:
+    if _decided(jaxpr, lanes).compiler != "llvm":
+        return None
+    try:
+        return lower.compiled(jaxpr, lanes)(*args)
+    except Unsupported as reason:
+        fallbacks.note(str(reason))
+    except Exception as error:  # XLA can still do it
+        fallbacks.note(repr(error))
+        warnings.warn(f"A kernel is left to XLA, please report it: {error!r}", RuntimeWarning, stacklevel=2)
+    return None
 
 
 def _by_xla(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Any) -> list[Any]:

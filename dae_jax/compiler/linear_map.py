@@ -79,6 +79,43 @@ def forward_map(
     return LinearMap(as_kernel(fn), inexact, transposed or no_transpose, change)
 
 
+def derivative_map(
+    fn: Callable[[Arrays], Arrays],
+    inexact: Sequence[bool],
+    moving: Sequence[bool],
+    results: int,
+    kernel: Callable[[Callable[..., Arrays]], Callable[..., Arrays]],
+) -> LinearMap:
+    """dx ↦ J(at) dx of the inexact results of `fn(at)`, so many, with regard to those arrays in `at` that are `moving`.
+
+    It has derivatives of any order in both modes, as far as `fn` has them; each is compiled by `kernel`.
+    """
+    n, count = len(moving), sum(moving)
+
+    def of_moving(at: Arrays) -> tuple[Callable[..., Arrays], Arrays]:
+        def values(*zs: Any) -> Arrays:
+            rest = iter(zs)
+            return list(filter(is_inexact, fn([next(rest) if m else x for x, m in zip(at, moving, strict=True)])))
+
+        return values, [x for x, m in zip(at, moving, strict=True) if m]
+
+    def pushed(at: Arrays, dxs: Arrays) -> Arrays:
+        values, xs = of_moving(at)
+        return jax.jvp(values, tuple(xs), tuple(dxs))[1]
+
+    def pulled(at: Arrays, cotangents: Arrays) -> Arrays:
+        values, xs = of_moving(at)
+        return list(jax.vjp(values, *xs)[1](list(cotangents)))
+
+    def change(apply: Callable[[Arrays, Arrays], Arrays], of: int, found: int) -> LinearMap:
+        also, still = [*inexact, *[True] * of], [*inexact, *[False] * of]
+        return derivative_map(lambda xs: apply(xs[:n], xs[n:]), also, still, found, kernel)
+
+    push = LinearMap(kernel(pushed), inexact, lambda: pull, lambda: change(pushed, count, results))
+    pull = LinearMap(kernel(pulled), inexact, lambda: push, lambda: change(pulled, results, count))
+    return push
+
+
 linear_p = Primitive("linear_map")
 linear_p.multiple_results = True
 

@@ -50,6 +50,10 @@ class ReducedResidual(AbstractResidualFormulation):
     inverts_mass: ClassVar[bool] = False
 
     @property
+    def name(self) -> str:
+        return DummyDerivatives.__name__
+
+    @property
     def keeps(self) -> tuple[bool, bool]:
         return True, True
 

@@ -30,6 +30,11 @@ class AbstractFormulation(eqx.Module):
     changes_field: ClassVar[bool] = True
 
     @property
+    def name(self) -> str:
+        """What the user calls it."""
+        return type(self).__name__
+
+    @property
     def keeps(self) -> tuple[bool, bool]:
         return False, False
 

@@ -1,18 +1,19 @@
 """What our compiler makes of a function gives what JAX gives: one element, and lanes."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from dae_jax.compiler import kernel_call, one_kernel
-from dae_jax.compiler.emit import machine
-from dae_jax.compiler.emit.machine import vector_size
+from dae_jax.compiler.emit.target import vector_size
 from dae_jax.compiler.jaxprs.inline import inlined
 from dae_jax.compiler.jaxprs.scalar_interpreter import Unsupported
-from dae_jax.compiler.lower import compiled, hindrances, module as compiler
+from dae_jax.compiler.lower import annotate, compiled, hindrances, unsupported, written
 from dae_jax.compiler.lower.lane_queue import main_loop
-from dae_jax.compiler.lower.module import written
+from dae_jax.compiler.thresholds import THRESHOLDS
 
 
 X = np.array([1.0, 2.0, -3.0])
@@ -254,13 +255,27 @@ def test_what_is_written_once_is_not_kept_beyond_a_branch():
 
 
 @pytest.mark.parametrize(
-    ("fn", "name"),
-    [(jnp.sort, "sort"), (lambda x: x.astype(jnp.float16), "convert_element_type"), (jax.lax.digamma, "digamma")],
-)
-def test_hindrances(fn, name):
+    ("fn", "name", "sentence"),
+    [
+        (jnp.fft.fft, "fft", "`fft` has no rule: c128[3] = fft c128[3]"),
+        (
+            lambda x: x.astype(jnp.float16), "convert_element_type",
+            "float16 is no type of number that is compiled: f16[3] = convert_element_type f64[3]",
+        ),
+        (jax.lax.digamma, "digamma", "`digamma` has no rule: f64[3] = digamma f64[3]"),
+        (
+            lambda x: jax.lax.while_loop(lambda c: jnp.abs(c[0]) < 3, lambda c: jnp.exp(c), x[:1] + 0j).real, "exp",
+            "`exp` of complex128 is not written: c128[1] = exp c128[1]",
+        ),
+        (lambda x: jax.debug.callback(print, x), "debug_callback", "`debug_callback` has side effects: = debug_callback f64[3]"),
+    ],
+)  # fmt: skip
+def test_what_is_not_compiled_is_said(fn, name, sentence):
     jaxpr = jax.make_jaxpr(fn)(X)
     assert name in hindrances(jaxpr)
-    with pytest.raises((Unsupported, KeyError)):
+    assert sentence in list(map(str, unsupported(jaxpr)))
+    assert str(annotate(jaxpr)) == str(unsupported(jaxpr)[0])
+    with pytest.raises(Unsupported):
         written(jaxpr, ())
 
 
@@ -270,7 +285,7 @@ def test_too_large(monkeypatch):
             x = jnp.sin(x) + x[::-1]
         return x
 
-    monkeypatch.setattr(compiler, "LIMIT", 1000)
+    monkeypatch.setattr("dae_jax.compiler.lower.judge.THRESHOLDS", dataclasses.replace(THRESHOLDS, instructions=1000))
     assert hindrances(jax.make_jaxpr(fn)(jnp.arange(100.0))) == ("size",)
 
 
@@ -367,35 +382,3 @@ def test_what_our_compiler_stumbles_over_is_done_by_xla(monkeypatch):
     monkeypatch.setattr(kernel_call.lower, "compiled", fails)
     with pytest.warns(RuntimeWarning, match="unforeseen"):
         np.testing.assert_allclose(jax.jit(one_kernel(lambda x: x * 2, "forward"))(X), 2 * X)
-
-
-def test_machine_code_is_kept_with_jax_s_own(tmp_path, monkeypatch):
-    text = written(jax.make_jaxpr(jnp.sin)(X)).replace("{name}", "kept")
-    before = jax.config.values["jax_compilation_cache_dir"]
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-    try:
-        code = machine._object_code(text)
-        monkeypatch.delattr(machine, "host")
-        assert machine._object_code(text) == code
-        with pytest.raises(NameError):
-            machine._object_code(text + "\n")
-    finally:
-        jax.config.update("jax_compilation_cache_dir", before)
-
-
-def test_a_broken_module_raises():
-    """LLVM's passes would end the process: a branch on a number that is defined in no block before it."""
-    broken = "define i64 @f(i1 %c) {\nentry:\nbr i1 %c, label %a, label %b\na:\n%x = add i64 1, 2\nbr label %b\nb:\nret i64 %x\n}"
-    with pytest.raises(Unsupported, match="LLVM"):
-        machine._object_code(broken)
-
-
-def test_code_made_by_other_passes_is_not_taken_from_the_cache(tmp_path, monkeypatch):
-    before = jax.config.values["jax_compilation_cache_dir"]
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-    try:
-        first = machine._cached("text")
-        monkeypatch.setattr(machine, "_SPEED", 3)
-        assert machine._cached("text") != first
-    finally:
-        jax.config.update("jax_compilation_cache_dir", before)

@@ -1,0 +1,57 @@
+"""Primitives that are written with simpler ones: a table from a primitive's name to a function of its operands.
+
+A function gets the operands and the parameters of the equation, and gives the results, as `jax.numpy` and `jax.lax` compute
+them. It raises `Unsupported` for what it does not take.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+from jax.extend.core import ClosedJaxpr
+
+from ..rewriting import Rewriting
+from ..walk import equations
+from .factorisations import cholesky, lu, lu_pivots_to_permutation
+from .orthogonal import geqrf, householder_product, qr
+from .sorting import sort
+from .triangular import triangular_solve
+
+
+EXPANSIONS: dict[str, Callable[..., Any]] = {
+    "cholesky": cholesky,
+    "geqrf": geqrf,
+    "householder_product": householder_product,
+    "lu": lu,
+    "lu_pivots_to_permutation": lu_pivots_to_permutation,
+    "qr": qr,
+    "sort": sort,
+    "triangular_solve": triangular_solve,
+}
+# lineax's: what it does shows where it is evaluated.
+_LINEAR_SOLVE = "linear_solve"
+
+
+def expanded(closed: ClosedJaxpr) -> ClosedJaxpr:
+    """The same function without the primitives of the table, at any depth."""
+    if not any(map(_is_expanded, equations(closed))):
+        return closed
+
+    def fn(*args: Any) -> list[Any]:
+        return rewriting.run(closed.jaxpr, closed.consts, args, [])[0]
+
+    rewriting = Rewriting(_is_expanded, lambda eqn, args, state: (_results(eqn, args), state))
+    return jax.make_jaxpr(fn)(*closed.in_avals)
+
+
+def _is_expanded(eqn: Any) -> bool:
+    return eqn.primitive.name in EXPANSIONS or eqn.primitive.name == _LINEAR_SOLVE
+
+
+def _results(eqn: Any, args: list[Any]) -> list[Any]:
+    name, params = eqn.primitive.name, eqn.primitive.get_bind_params(eqn.params)
+    if name in EXPANSIONS:
+        out = EXPANSIONS[name](*args, **params)
+        return list(out) if eqn.primitive.multiple_results else [out]
+    inner = expanded(jax.make_jaxpr(lambda *xs: eqn.primitive.impl(*xs, **params))(*args))
+    return jax.core.eval_jaxpr(inner.jaxpr, inner.consts, *args)

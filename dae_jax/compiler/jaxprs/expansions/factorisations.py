@@ -1,0 +1,149 @@
+"""LU with partial pivoting, and Cholesky, of small matrices: written out, or in a loop over columns."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from ..scalar_interpreter import Unsupported
+
+
+# Up to this size every entry is a number of its own. TODO measured
+WRITTEN_OUT = 4
+# LAPACK's blocks are faster above.
+LARGEST = 64
+
+
+def refuse_large(name: str, *sizes: int) -> None:
+    """Raises `Unsupported` for matrices that are LAPACK's."""
+    if max(sizes) > LARGEST:
+        raise Unsupported(f"{name} of more than {LARGEST} rows or columns")
+
+
+def of_batch(fn: Callable[..., Any], batch: int) -> Callable[..., Any]:
+    """`fn` for operands with so many leading axes."""
+    for _ in range(batch):
+        fn = jax.vmap(fn)
+    return fn
+
+
+def lu(a: Any, *, pivot_size: int | None = None, **_: Any) -> tuple[Any, Any, Any]:
+    """L and U in one matrix, the rows that were exchanged, and the permutation; as LAPACK's getrf.
+
+    A column of zeros is no pivot and stays as it is.
+    """
+    m, n = a.shape[-2:]
+    refuse_large("lu", m, n)
+    if not m * n:
+        raise Unsupported("lu of an empty matrix")
+    return of_batch(_lu_written_out if max(m, n) <= WRITTEN_OUT else _lu_in_loop, a.ndim - 2)(a)
+
+
+def _size(x: Any) -> Any:
+    return jnp.abs(x.real) + jnp.abs(x.imag) if jnp.iscomplexobj(x) else jnp.abs(x)
+
+
+def _lu_written_out(a: Any) -> tuple[Any, Any, Any]:
+    m, n = a.shape
+    rows = [[a[i, j] for j in range(n)] for i in range(m)]
+    order: list[Any] = [jnp.int32(i) for i in range(m)]
+    pivots = []
+    for k in range(min(m, n)):
+        largest, pivot = _size(rows[k][k]), jnp.int32(k)
+        for i in range(k + 1, m):
+            larger = _size(rows[i][k]) > largest
+            largest = jnp.where(larger, _size(rows[i][k]), largest)
+            pivot = jnp.where(larger, jnp.int32(i), pivot)
+        pivots.append(pivot)
+        for i in range(k + 1, m):
+            swap = pivot == i
+            top, row = [*rows[k], order[k]], [*rows[i], order[i]]
+            *rows[k], order[k] = [jnp.where(swap, y, x) for x, y in zip(top, row, strict=True)]
+            *rows[i], order[i] = [jnp.where(swap, x, y) for x, y in zip(top, row, strict=True)]
+        by = jnp.where(rows[k][k] == 0, 1, rows[k][k])
+        for i in range(k + 1, m):
+            factor = rows[i][k] / by
+            rows[i] = [*rows[i][:k], factor, *(x - factor * y for x, y in zip(rows[i][k + 1 :], rows[k][k + 1 :], strict=True))]
+    return jnp.stack([jnp.stack(row) for row in rows]), jnp.stack(pivots), jnp.stack(order)
+
+
+def _lu_in_loop(a: Any) -> tuple[Any, Any, Any]:
+    m, n = a.shape
+    row, column = jnp.arange(m), jnp.arange(n)
+
+    def eliminate(k: Any, carry: Any) -> Any:
+        a, pivots, order = carry
+        sizes = _size(a[:, k])
+        # What is not a number is a pivot only where it stands.
+        sizes = jnp.where(jnp.isnan(sizes), jnp.where(row == k, jnp.inf, -1), sizes)
+        pivot = jnp.argmax(jnp.where(row >= k, sizes, -1)).astype(jnp.int32)
+        swapped = jnp.where(row == k, pivot, jnp.where(row == pivot, k, row))
+        a, order = a[swapped], order[swapped]
+        by = jnp.where(a[k, k] == 0, 1, a[k, k])
+        factors = jnp.where(row > k, a[:, k] / by, 0)
+        a = a - factors[:, None] * jnp.where(column > k, a[k], 0)
+        a = jnp.where((column == k) & (row[:, None] > k), factors[:, None], a)
+        return a, pivots.at[k].set(pivot), order
+
+    start = (a, jnp.zeros(min(m, n), jnp.int32), jnp.arange(m, dtype=jnp.int32))
+    return jax.lax.fori_loop(0, min(m, n), eliminate, start)
+
+
+def lu_pivots_to_permutation(pivots: Any, *, permutation_size: int, **_: Any) -> Any:
+    """The order of the rows after the exchanges."""
+    count = pivots.shape[-1]
+
+    def permutation(pivots: Any) -> Any:
+        order = jnp.arange(permutation_size, dtype=jnp.int32)
+        for k in range(count):
+            j = pivots[k]
+            place = jnp.arange(permutation_size)
+            order = jnp.where(place == k, order[j], jnp.where(place == j, order[k], order))
+        return order
+
+    refuse_large("lu", permutation_size)
+    return of_batch(permutation, pivots.ndim - 1)(pivots)
+
+
+def cholesky(a: Any, **_: Any) -> Any:
+    """L with L Lᴴ = a, of its lower half; not a number where a is not positive definite."""
+    refuse_large("cholesky", a.shape[-1])
+    n = a.shape[-1]
+    return of_batch(_cholesky_written_out if n <= WRITTEN_OUT else _cholesky_in_loop, a.ndim - 2)(a)
+
+
+def _cholesky_written_out(a: Any) -> Any:
+    n = len(a)
+    zero = jnp.zeros((), a.dtype)
+    found: list[list[Any]] = [[zero] * n for _ in range(n)]
+    definite = jnp.bool_(True)
+    for j in range(n):
+        square = a[j, j].real - sum((_size_squared(x) for x in found[j][:j]), jnp.zeros((), a.real.dtype))
+        definite &= square > 0
+        root = jnp.sqrt(square)
+        found[j][j] = root.astype(a.dtype)
+        for i in range(j + 1, n):
+            rest = a[i, j] - sum((x * y.conj() for x, y in zip(found[i][:j], found[j][:j], strict=True)), zero)
+            found[i][j] = rest / root
+    return jnp.where(definite, jnp.stack([jnp.stack(row) for row in found]), jnp.nan)
+
+
+def _size_squared(x: Any) -> Any:
+    return x.real**2 + x.imag**2 if jnp.iscomplexobj(x) else x * x
+
+
+def _cholesky_in_loop(a: Any) -> Any:
+    n = len(a)
+    row = jnp.arange(n)
+
+    def column(j: Any, carry: Any) -> Any:
+        found, definite = carry
+        rest = a[:, j] - found @ found[j].conj()
+        square = rest[j].real
+        root = jnp.sqrt(square)
+        column = jnp.where(row > j, rest / root, jnp.where(row == j, root.astype(a.dtype), 0))
+        return found.at[:, j].set(column), definite & (square > 0)
+
+    found, definite = jax.lax.fori_loop(0, n, column, (jnp.zeros_like(a), jnp.bool_(True)))
+    return jnp.where(definite, found, jnp.nan)

@@ -1,0 +1,70 @@
+"""QR by Householder reflections, of small matrices."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from ..scalar_interpreter import Unsupported
+from .factorisations import of_batch, refuse_large
+
+
+def qr(a: Any, *, pivoting: bool, full_matrices: bool, **_: Any) -> tuple[Any, Any]:
+    """Q and R."""
+    if pivoting:
+        raise Unsupported("qr with pivoting")
+    m, n = a.shape[-2:]
+    k = m if full_matrices else min(m, n)
+    reflections, taus = geqrf(a)
+    wide = jnp.zeros((*a.shape[:-2], m, k), a.dtype).at[..., :, : min(n, k)].set(reflections[..., :, : min(n, k)])
+    return householder_product(wide, taus), jnp.triu(reflections[..., :k, :])
+
+
+def geqrf(a: Any, **_: Any) -> tuple[Any, Any]:
+    """R, the reflections' vectors below it, and their factors τ, as LAPACK has them: H = 1 − τ v vᴴ with v₀ = 1."""
+    refuse_large("geqrf", *a.shape[-2:])
+    return of_batch(_reflected, a.ndim - 2)(a)
+
+
+def _reflected(a: Any) -> tuple[Any, Any]:
+    m, n = a.shape
+    row = jnp.arange(m)
+
+    def reflect(k: Any, carry: Any) -> Any:
+        a, taus = carry
+        alpha, below = a[k, k], jnp.where(row > k, a[:, k], 0)
+        length = jnp.sqrt(jnp.sum(_square(below)) + _square(alpha))
+        beta = jnp.where(alpha.real >= 0, -length, length)
+        # Nothing is reflected that points along the first axis already.
+        still = (jnp.sum(_square(below)) == 0) & (alpha.imag == 0 if jnp.iscomplexobj(a) else True)
+        tau = jnp.where(still, 0, (beta - alpha) / jnp.where(still, 1, beta))
+        v = jnp.where(row == k, 1, below / jnp.where(still, 1, alpha - beta))
+        a_after = a - jnp.conj(tau) * v[:, None] * (v.conj() @ a)
+        a_after = jnp.where(jnp.arange(n) > k, a_after, a)
+        column = jnp.where(row > k, v, jnp.where(row == k, jnp.where(still, alpha, beta.astype(a.dtype)), a[:, k]))
+        return a_after.at[:, k].set(column), taus.at[k].set(tau)
+
+    taus = jnp.zeros(min(m, n), a.dtype)
+    return jax.lax.fori_loop(0, min(m, n), reflect, (a, taus))
+
+
+def _square(x: Any) -> Any:
+    return x.real**2 + x.imag**2 if jnp.iscomplexobj(x) else x * x
+
+
+def householder_product(a: Any, taus: Any, **_: Any) -> Any:
+    """The first columns of the product of the reflections."""
+    refuse_large("householder_product", *a.shape[-2:])
+    return of_batch(_product, a.ndim - 2)(a, taus)
+
+
+def _product(a: Any, taus: Any) -> Any:
+    m, n = a.shape
+    row, count = jnp.arange(m), len(taus)
+
+    def reflect(i: Any, q: Any) -> Any:
+        k = count - 1 - i
+        v = jnp.where(row == k, 1, jnp.where(row > k, a[:, k], 0))
+        return q - taus[k] * v[:, None] * (v.conj() @ q)
+
+    return jax.lax.fori_loop(0, count, reflect, jnp.eye(m, n, dtype=a.dtype))

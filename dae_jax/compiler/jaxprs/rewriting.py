@@ -1,0 +1,110 @@
+"""Jaxprs with some of their equations, at any depth, replaced by others."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+from jax.extend.core import ClosedJaxpr, Literal
+
+from .scalar_interpreter import CALLS as OF_CALLS, Unsupported
+from .walk import equations, equations_in
+
+
+CALLS = {**OF_CALLS, "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr"}
+
+
+class Rewriting:
+    """Runs jaxprs with what replaces an equation in its place.
+
+    `applies` says of an equation whether it is replaced. `replacement` gives its results for its operands, and the state
+    that follows: a list of arrays that passes through all replacements in their order, also through loops and branches.
+    `stops` says of the state whether all loops end.
+    """
+
+    def __init__(
+        self,
+        applies: Callable[[Any], bool],
+        replacement: Callable[[Any, list[Any], list[Any]], tuple[list[Any], list[Any]]],
+        stops: Callable[[list[Any]], Any] | None = None,
+    ) -> None:
+        self._applies, self._replacement, self._stops = applies, replacement, stops
+
+    def run(self, jaxpr: Any, consts: Any, args: Sequence[Any], state: list[Any]) -> tuple[list[Any], list[Any]]:
+        """The results of a jaxpr, and the state after it."""
+        env = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *args], strict=True))
+        read = lambda v: v.val if isinstance(v, Literal) else env[v]
+        for eqn in jaxpr.eqns:
+            results, state = self._equation(eqn, list(map(read, eqn.invars)), state)
+            env.update(zip(eqn.outvars, results, strict=True))
+        return list(map(read, jaxpr.outvars)), state
+
+    def _equation(self, eqn: Any, args: list[Any], state: list[Any]) -> tuple[list[Any], list[Any]]:
+        name, p = eqn.primitive.name, eqn.params
+        if self._applies(eqn):
+            return self._replacement(eqn, args, state)
+        if not any(map(self._applies, equations_in(eqn))):
+            results = eqn.primitive.bind(*args, **eqn.primitive.get_bind_params(p))
+            return results if eqn.primitive.multiple_results else [results], state
+        if name in CALLS:
+            inner = p[CALLS[name]]
+            jaxpr, consts = (inner.jaxpr, inner.consts) if isinstance(inner, ClosedJaxpr) else (inner, ())
+            return self.run(jaxpr, consts, args, state)
+        match name:
+            case "cond":
+                which, *operands = args
+                found = jax.lax.switch(which, list(map(self._joined, p["branches"])), *operands, *state)
+                return _parted(found, len(eqn.outvars))
+            case "while":
+                return _parted(self._while(eqn, args, state), len(eqn.outvars))
+            case "scan":
+                return self._scan(p, args, state)
+            case "custom_linear_solve":
+                solve = p["jaxprs"].solve
+                return self.run(solve.jaxpr, solve.consts, of_solve(p, args), state)
+        raise Unsupported(f"{name} with something in it that is to be replaced")
+
+    def _joined(self, closed: ClosedJaxpr) -> Callable[..., list[Any]]:
+        n = len(closed.jaxpr.invars)
+        return lambda *xs: [y for ys in self.run(closed.jaxpr, closed.consts, xs[:n], list(xs[n:])) for y in ys]
+
+    def _while(self, eqn: Any, args: list[Any], state: list[Any]) -> list[Any]:
+        p, count = eqn.params, len(state)
+        n, condition = p["cond_nconsts"], p["cond_jaxpr"]
+        changes = any(map(self._applies, equations(condition)))
+        if state and (changes or condition.out_avals[0].shape):
+            raise Unsupported("a check in the condition of a loop, or in a loop with several conditions")
+
+        def goes_on(*xs: Any) -> Any:
+            (found,), _ = self.run(condition.jaxpr, condition.consts, xs[: len(xs) - count], [])
+            return found & ~self._stops(list(xs[len(xs) - count :])) if self._stops and state else found
+
+        structs = list(map(jax.typeof, [*args, *state]))
+        m = n + p["body_nconsts"]
+        params = {
+            **p,
+            "cond_jaxpr": jax.make_jaxpr(goes_on)(*structs[:n], *structs[m:]),
+            "body_jaxpr": jax.make_jaxpr(self._joined(p["body_jaxpr"]))(*structs[n:]),
+        }
+        return eqn.primitive.bind(*args, *state, **params)
+
+    def _scan(self, p: Any, args: list[Any], state: list[Any]) -> tuple[list[Any], list[Any]]:
+        n, k, body = p["num_consts"], p["num_carry"], p["jaxpr"]
+
+        def turn(carry: Any, xs: Any) -> Any:
+            found, now = self.run(body.jaxpr, body.consts, [*args[:n], *carry[0], *xs], carry[1])
+            return (found[:k], now), found[k:]
+
+        (carry, state), ys = jax.lax.scan(
+            turn, (args[n : n + k], state), args[n + k :], p["length"], p["reverse"], p["unroll"]
+        )
+        return [*carry, *ys], state
+
+
+def of_solve(p: Any, args: list[Any]) -> list[Any]:
+    """The operands of a `custom_linear_solve` that the function which finds the solution takes."""
+    start, count = sum(p["const_lengths"][:2]), p["const_lengths"].solve
+    return args[start : start + count] + args[sum(p["const_lengths"]) :]
+
+
+def _parted(found: Sequence[Any], n: int) -> tuple[list[Any], list[Any]]:
+    return list(found[:n]), list(found[n:])

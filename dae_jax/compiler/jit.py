@@ -1,0 +1,156 @@
+"""Any function of small arrays and loops as one piece of machine code: `jit`."""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import jaxpr_as_fun
+
+from .inspection import Lowered
+from .jaxprs.checks import checks_apart
+from .jaxprs.expansions import expanded
+from .jaxprs.scalar_interpreter import Unsupported
+from .kernel_call import called
+from .linear_map import Arrays, derivative_map, is_inexact
+from .settings import one_kernel_enabled
+
+
+def jit(
+    fn: Callable[..., Any],
+    *,
+    static_argnums: int | Sequence[int] | None = None,
+    static_argnames: str | Sequence[str] | None = None,
+) -> "Jitted":
+    """`jax.jit(fn)`, compiled to one kernel on the CPU: for functions of small arrays, with loops of many turns.
+
+    XLA runs the operations of a loop's body one after another and pays for each; here the whole loop is one function in
+    machine code. A solve by `diffrax.diffeqsolve` is such a function.
+
+    - `static_argnums`, `static_argnames`: as `jax.jit` has them.
+
+    Under `jax.vmap` the elements of the batch become lanes of vectors, on all cores. Derivatives in either mode and of any
+    order, as far as `fn` has them, are compiled in the same way. Checks by `equinox.error_if` raise when the kernel is done.
+    What cannot be one kernel is compiled by XLA as `jax.jit` does it, and so is everything on other backends;
+    `jit(fn).lower(*args)` says which it is, and why.
+    """
+    return Jitted(fn, static_argnums, static_argnames)
+
+
+class Jitted:
+    """A function that is compiled when it is called; see `jit`."""
+
+    def __init__(self, fn: Callable[..., Any], static_argnums: Any, static_argnames: Any) -> None:
+        functools.update_wrapper(self, fn, updated=())
+        self._fn = fn
+        self._statics = {"static_argnums": static_argnums, "static_argnames": static_argnames}
+        self._compiled = jax.jit(self._like_fn(self._traced), **self._statics)
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """What `fn` gives."""
+        return self._compiled(*args, **kwargs)
+
+    def lower(self, *args: Any, **kwargs: Any) -> Lowered:
+        """How a call with these arguments is compiled; nothing is run."""
+        found: list[Lowered] = []
+
+        def look(*args: Any, **kwargs: Any) -> None:
+            flat, arrays, _ = _of_arrays(self._fn, args, kwargs)
+            jaxpr = jax.make_jaxpr(flat)(*arrays)
+            try:
+                found.append(Lowered.of(jaxpr, *checks_apart(expanded(jaxpr))))
+            except Unsupported as reason:
+                found.append(Lowered(jaxpr, jaxpr, "xla", (reason,)))
+
+        jax.jit(self._like_fn(look), **self._statics).trace(*args, **kwargs)
+        return found[0]
+
+    def _like_fn(self, body: Callable[..., Any]) -> Callable[..., Any]:
+        """`body` by the name of `fn` and with its signature, by which JAX finds static arguments."""
+        return functools.wraps(self._fn)(lambda *args, **kwargs: body(*args, **kwargs))
+
+    def __get__(self, instance: Any, owner: Any = None) -> Any:
+        return self if instance is None else functools.partial(self, instance)
+
+    def _traced(self, *args: Any, **kwargs: Any) -> Any:
+        if not one_kernel_enabled() or jax.default_backend() != "cpu":
+            return self._fn(*args, **kwargs)
+        flat, arrays, tree = _of_arrays(self._fn, args, kwargs)
+        jaxpr = jax.make_jaxpr(flat)(*arrays)
+        # Of what an outer transformation traces the kernel has derivatives and lanes too.
+        traced = [isinstance(x, jax.core.Tracer) for x in jaxpr.consts]
+        constants = [x for x, t in zip(jaxpr.consts, traced, strict=True) if t]
+
+        def closed(*xs: Any) -> Arrays:
+            given = iter(xs)
+            consts = [next(given) if t else x for x, t in zip(jaxpr.consts, traced, strict=True)]
+            return jax.core.eval_jaxpr(jaxpr.jaxpr, consts, *given)
+
+        return jax.tree.unflatten(tree[0], _differentiable(closed)(*constants, *arrays))
+
+
+def _of_arrays(fn: Callable[..., Any], args: Any, kwargs: Any) -> tuple[Callable[..., Arrays], Arrays, list[Any]]:
+    """`fn` as a function of the traced leaves of its arguments, these, and where the tree of its results will be."""
+    leaves, treedef = jax.tree.flatten((args, kwargs))
+    traced = [isinstance(x, jax.core.Tracer) for x in leaves]
+    tree: list[Any] = []
+
+    def flat(*arrays: Any) -> Arrays:
+        given = iter(arrays)
+        args, kwargs = jax.tree.unflatten(treedef, [next(given) if t else x for x, t in zip(leaves, traced, strict=True)])
+        out, tree[:] = _flattened(fn(*args, **kwargs))
+        return out
+
+    return flat, [x for x, t in zip(leaves, traced, strict=True) if t], tree
+
+
+def _flattened(tree: Any) -> tuple[Arrays, list[Any]]:
+    leaves, treedef = jax.tree.flatten(tree)
+    return leaves, [treedef]
+
+
+def _differentiable(fn: Callable[..., Arrays]) -> Callable[..., Arrays]:
+    """`fn` as one kernel, with its derivatives."""
+
+    @jax.custom_jvp
+    def call(*xs: Any) -> Arrays:
+        return _kernel(fn)(*xs)
+
+    @functools.partial(call.defjvp, symbolic_zeros=True)
+    def _(xs: Any, dxs: Any) -> Any:
+        out = call(*xs)
+        moving = [not isinstance(dx, jax.custom_derivatives.SymbolicZero) for dx in dxs]
+        known = list(filter(is_inexact, out))
+        push = derivative_map(lambda at: fn(*at), list(map(is_inexact, xs)), moving, len(known), _kernel)
+        found = iter(push(xs, [dx for dx, m in zip(dxs, moving, strict=True) if m], known))
+        return out, [next(found) if is_inexact(y) else np.zeros(jnp.shape(y), jax.dtypes.float0) for y in out]
+
+    return call
+
+
+def _kernel(fn: Callable[..., Arrays]) -> Callable[..., Arrays]:
+    """`fn`, of arrays and lists of them, as one kernel; its checks raise when that is done."""
+
+    def call(*args: Any) -> Arrays:
+        leaves, treedef = jax.tree.flatten(args)
+        # A kernel knows of no mesh; JAX would write down for each number that it lies on none.
+        with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
+            jaxpr = jax.make_jaxpr(lambda *xs: fn(*jax.tree.unflatten(treedef, xs)))(*leaves)
+            try:
+                kernel, messages = checks_apart(expanded(jaxpr))
+                results = called(kernel, leaves)
+            except Unsupported:
+                results = None
+        return jaxpr_as_fun(jaxpr)(*leaves) if results is None else _raising(results, messages)
+
+    return call
+
+
+def _raising(out: Arrays, messages: tuple[str, ...]) -> Arrays:
+    if not messages:
+        return out
+    *out, failed = out
+    return eqx.branched_error_if(out, failed != 0, failed - 1, messages)
