@@ -101,7 +101,7 @@ def prepared(
         formulation = _for_residuals(system, t0, y0, args, solver)
     elif formulation is None:
         formulation = Differentiation()
-    refuse_misfits(system, formulation, solver, t0, y0, args)
+    refuse_misfits(formulation, solver)
     refuse_other_steps(solver, stepsize_controller, dt0)
     if isinstance(formulation, Residual) and formulation.variable_index is None:
         why_not = _why_not_as_written(system, t0, y0, args, formulation, solver.highest_index)

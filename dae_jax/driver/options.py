@@ -84,8 +84,8 @@ def _refuse_bad_tolerances(controller: Any) -> None:
         )
 
 
-def refuse_misfits(system: Any, formulation: Any, solver: Any, t0: Any, y0: Any, args: Any) -> None:
-    """Refuses pairs of formulation and solver that make no sense, and shapes that do not fit."""
+def refuse_misfits(formulation: Any, solver: Any) -> None:
+    """Refuses pairs of formulation and solver that make no sense."""
     refuse_no_solver(solver)
     if not isinstance(formulation, AbstractFormulation):
         other = ": give it as `solver`" if isinstance(formulation, diffrax.AbstractSolver) else ""
@@ -109,14 +109,11 @@ def refuse_misfits(system: Any, formulation: Any, solver: Any, t0: Any, y0: Any,
             f"{type(formulation).__name__} takes an explicit Runge–Kutta solver such as DOP853(), RadauIIA5() or BDF(), but "
             f"got {brief(solver)}."
         )
-    formulation.refuse(system)
-    if isinstance(solver, AbstractManifoldSolver):
-        if not formulation.leaves_constraints:
-            raise ValueError(
-                f"{type(formulation).__name__} has no constraints left for {name} to keep: in its chart they hold by "
-                "construction. Use the inner solver itself."
-            )
-        solver.refuse(system, formulation, t0, y0, args)
+    if not formulation.leaves_constraints and isinstance(solver, AbstractManifoldSolver):
+        raise ValueError(
+            f"{type(formulation).__name__} has no constraints left for {name} to keep: in its chart they hold by "
+            "construction. Use the inner solver itself."
+        )
 
 
 def refuse_no_solver(solver: Any) -> None:

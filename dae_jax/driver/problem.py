@@ -1,5 +1,7 @@
 """What is solved, and how a pytree is taken apart into its arrays and the rest, which is known while tracing."""
 
+import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -10,7 +12,13 @@ from ..compiler import one_kernel_enabled
 from ..equations.constraint_jacobian import Rank
 
 
-class Problem(eqx.Module):
+@functools.partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("system", "t0", "t1", "dt0", "y0", "args"),
+    meta_fields=("rank",),
+)
+@dataclasses.dataclass(frozen=True, eq=False)
+class Problem:
     """All of a solve but its method: a system from `t0` to `t1`, its start, and how many of its constraints are
     independent there (`None`: all).
     """
@@ -21,7 +29,7 @@ class Problem(eqx.Module):
     dt0: Any
     y0: Any
     args: Any
-    rank: int | Rank | None = eqx.field(static=True)
+    rank: int | Rank | None
 
     @property
     def start(self) -> tuple[Any, Any, Any, Any]:

@@ -76,9 +76,14 @@ class Solve(eqx.Module):
         return judged(self, fields, problem, found), as_expected
 
     def refuse_wrong_functions(self, problem: Problem) -> None:
-        """Refuses functions of the user that do not take or return what they must, in a sentence."""
+        """Refuses functions of the user that do not take or return what they must, and a system that the method is not for,
+        in a sentence.
+        """
         system, *start = problem.start
         refuse_wrong_functions(system, *start)
+        self.formulation.refuse(system)
+        if isinstance(self.solver, AbstractManifoldSolver):
+            self.solver.refuse(system, self.formulation, *start)
         refuse_wrong_event(self.event, *start)
         for part in saved_parts(self.saveat):
             returned("saveat.fn(t, y, args)", part.fn, *start)
