@@ -24,7 +24,9 @@ from .explain import (
 )
 from .formulations import (
     GGL as GGL,
+    AbstractFieldFormulation as AbstractFieldFormulation,
     AbstractFormulation as AbstractFormulation,
+    AbstractResidualFormulation as AbstractResidualFormulation,
     Baumgarte as Baumgarte,
     Differentiation as Differentiation,
     DummyDerivatives as DummyDerivatives,
@@ -37,6 +39,8 @@ from .solvers import (
     BDF as BDF,
     DOP853 as DOP853,
     RATTLE as RATTLE,
+    AbstractManifoldSolver as AbstractManifoldSolver,
+    AbstractResidualSolver as AbstractResidualSolver,
     Gauss4 as Gauss4,
     Midpoint as Midpoint,
     OrthogonalProjection as OrthogonalProjection,
