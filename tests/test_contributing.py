@@ -1,0 +1,27 @@
+"""What CONTRIBUTING says of the code is true of it."""
+
+import re
+from pathlib import Path
+
+from tests.test_layers import FLOORS
+
+
+ROOT = Path(__file__).parent.parent
+TEXT = (ROOT / "CONTRIBUTING.md").read_text()
+
+
+def test_the_way_of_y0_names_what_is_there():
+    found = re.findall(r"`(dae_jax/[\w/]+\.py)` `(\w+)`", TEXT)
+    assert len(found) >= 8
+    for path, name in found:
+        assert re.search(rf"^\s*(def|class) {name}\b", (ROOT / path).read_text(), re.MULTILINE), (path, name)
+
+
+def test_files_that_are_named_exist():
+    for path in re.findall(r"(?<![\w/])((?:dae_jax|tests)/[\w/]+(?:\.py|\.md)?)", TEXT):
+        assert (ROOT / path).exists(), path
+
+
+def test_the_house_is_that_of_the_layers():
+    rows = re.findall(r"^\| (\d+) \| ([^|]+) \|", TEXT, re.MULTILINE)
+    assert [set(re.findall(r"`(\w+)`", rooms)) for _, rooms in rows] == [set(f) for f in FLOORS[:-1]]
