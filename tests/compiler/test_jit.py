@@ -174,6 +174,15 @@ class TestLowered:
             text = jax.jit(lambda x, fn=fn: jit(fn)(x)).lower(X).as_text()
             assert ("@dae_jax_" in text) == (jit(fn).lower(X).compiler == "llvm")
 
+    def test_what_is_too_large_for_lanes_only(self):
+        fn = jit(lambda x: jnp.sum(jnp.cumsum(jnp.sin(x + jnp.arange(2.0**24)))))
+        alone = fn.lower(1.0)
+        assert (alone.compiler, alone.batch().compiler == "llvm") == ("llvm", False)
+        assert [reason.primitive for reason in alone.batch().unsupported] == ["size"]
+        lower = lambda fn, x: jax.jit(fn).lower(x).as_text()
+        assert "@dae_jax_" in lower(fn, 1.0)
+        assert "@dae_jax_" not in lower(jax.vmap(fn), jnp.ones(9))
+
 
 def oscillator(t, y, args):
     return jnp.stack([y[1], -args * jnp.sin(y[0])])
