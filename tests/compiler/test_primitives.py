@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax._src.lax import lax as lax_total
+from jax.extend.random import threefry2x32_p
 
 from dae_jax.compiler.lower import annotate, compiled
 
@@ -42,7 +43,8 @@ def same(fn, *args, ulps=0, atol=0.0):
             else:
                 np.testing.assert_array_equal(found, expected)
             if np.issubdtype(c.dtype, np.floating):
-                np.testing.assert_array_equal(np.signbit(found), np.signbit(expected) | np.signbit(found) * np.isnan(found))
+                signs = [np.signbit(y) & ~np.isnan(y) for y in (found, expected)]
+                np.testing.assert_array_equal(*signs)
 
 
 INTEGERS = [f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)]
@@ -151,3 +153,21 @@ def test_many_complex_numbers():
         return [f(w) for w in (jnp.prod(z), jnp.prod(z, 1), jnp.cumprod(z, 0), z**-2, jnp.square(z)) for f in (jnp.real, jnp.imag)]
 
     same(fn, np.random.default_rng(0).uniform(0.5, 0.8, (LANES, 60)), ulps=10_000)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_special_functions(dtype):
+    def fn(x, y):
+        inside = [z / 4 for z in (x, y)]
+        return [f(z) for z in (*inside, *(jnp.floor(z) for z in (x, y))) for f in (LAX.erf_inv, LAX.digamma, LAX.lgamma)]
+
+    rng = np.random.default_rng(0)
+    numbers = [rng.uniform(-5, 5, (LANES, n)).astype(dtype) for n in (5, 40)]
+    numbers[0][0] = [4, -4, 0, np.nan, np.inf]
+    same(fn, *numbers, ulps=300, atol=20 * np.finfo(dtype).eps)
+
+
+def test_random_bits():
+    key = np.arange(2 * LANES, dtype=np.uint32).reshape(LANES, 2)
+    hashed = lambda k, x, y: [z for c in (x, y) for z in threefry2x32_p.bind(k[0], k[1], c, c[::-1])]
+    same(hashed, key, edges("uint32", (LANES, 4)), edges("uint32", (LANES, 40)))
