@@ -171,3 +171,24 @@ def test_random_bits():
     key = np.arange(2 * LANES, dtype=np.uint32).reshape(LANES, 2)
     hashed = lambda k, x, y: [z for c in (x, y) for z in threefry2x32_p.bind(k[0], k[1], c, c[::-1])]
     same(hashed, key, edges("uint32", (LANES, 4)), edges("uint32", (LANES, 40)))
+
+
+def test_random_numbers():
+    """Keys that are made, split and folded in, in loops and branches, of one type and as numbers."""
+
+    def fn(seed, x):
+        key = jax.random.key(seed)
+        old, keys = jax.random.PRNGKey(seed), jax.random.split(key, 3)
+
+        def turn(i, carry):
+            key, total = carry
+            key, now = jax.random.split(jax.random.fold_in(key, i))
+            more = jax.lax.cond(total[0] > 0, lambda k: jax.random.uniform(k, (2,)), lambda k: -jax.random.uniform(k, (2,)), now)
+            return key, total + more
+
+        end, total = jax.lax.fori_loop(0, 4, turn, (key, x))
+        each = jax.vmap(lambda k: jax.random.bits(k, (2, 2)))(keys)
+        ends = [jax.random.key_data(end), jax.random.randint(keys[1], (3,), 0, 100), jax.random.bernoulli(keys[2], 0.3, (40,))]
+        return [total, each, jax.random.normal(old, (3,)), *ends]
+
+    same(fn, np.arange(LANES), np.random.default_rng(0).normal(size=(LANES, 2)), ulps=4)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
 
+from .random_keys import without_keys
 from .scalar_interpreter import CALLS as OF_CALLS
 from .special_functions import SPECIAL, by_simpler_ones
 
@@ -26,7 +27,7 @@ _COMMUTATIVE = frozenset({"add", "add_any", "mul", "max", "min", "and", "or", "x
 
 def inlined(closed: ClosedJaxpr) -> ClosedJaxpr:
     """A jaxpr that computes the same."""
-    flat = _Flat()
+    closed, flat = without_keys(closed), _Flat()
     inputs = [Var(v.aval) for v in closed.jaxpr.invars]
     outputs = flat.run(closed, inputs)
     needed, eqns = {v for v in outputs if isinstance(v, Var)}, []

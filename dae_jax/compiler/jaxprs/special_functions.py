@@ -41,7 +41,7 @@ _ERF_INV_64 = (
 )  # fmt: skip
 
 
-def erf_inv(x: Any) -> Any:
+def erf_inv(x: Any, **_: Any) -> Any:
     """y with erf(y) = x."""
     w = -jnp.log1p(-x * x)
     root = jnp.sqrt(w)
@@ -62,7 +62,7 @@ _LANCZOS = (
 )  # fmt: skip
 
 
-def digamma(x: Any) -> Any:
+def digamma(x: Any, **_: Any) -> Any:
     """The derivative of log Γ(x), by Lanczos' approximation; below 1/2 by reflection."""
     reflected = x < 0.5
     z = jnp.where(reflected, -x, x - 1)
@@ -93,16 +93,28 @@ def threefry2x32(key1: Any, key2: Any, x1: Any, x2: Any) -> tuple[Any, Any]:
     return x1, x2
 
 
-SPECIAL: dict[str, Callable[..., Any]] = {"digamma": digamma, "erf_inv": erf_inv, "threefry2x32": threefry2x32}
+def iota_2x32_shape(*, shape: tuple[int, ...]) -> tuple[Any, Any]:
+    """The places of an array's entries in row-major order, in two halves of 64 bits."""
+    low = jnp.arange(math.prod(shape), dtype=jnp.uint32).reshape(shape)
+    return jnp.zeros_like(low), low
+
+
+SPECIAL: dict[str, Callable[..., Any]] = {
+    "digamma": digamma,
+    "erf_inv": erf_inv,
+    "threefry2x32": threefry2x32,
+    "iota_2x32_shape": iota_2x32_shape,
+}
 
 
 def by_simpler_ones(eqn: Any) -> ClosedJaxpr:
     """A jaxpr that computes what an equation does whose primitive is in the table."""
-    found = _traced(eqn.primitive.name, tuple((v.aval.shape, v.aval.dtype) for v in eqn.invars))
+    structs = tuple((v.aval.shape, v.aval.dtype) for v in eqn.invars)
+    found = _traced(eqn.primitive.name, structs, tuple(eqn.params.items()))
     assert [(a.shape, a.dtype) for a in found.out_avals] == [(v.aval.shape, v.aval.dtype) for v in eqn.outvars]
     return found
 
 
 @functools.lru_cache(maxsize=64)
-def _traced(name: str, structs: tuple[Any, ...]) -> ClosedJaxpr:
-    return jax.make_jaxpr(SPECIAL[name])(*(jax.ShapeDtypeStruct(*s) for s in structs))
+def _traced(name: str, structs: tuple[Any, ...], params: tuple[Any, ...]) -> ClosedJaxpr:
+    return jax.make_jaxpr(functools.partial(SPECIAL[name], **dict(params)))(*(jax.ShapeDtypeStruct(*s) for s in structs))
