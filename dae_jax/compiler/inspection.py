@@ -1,7 +1,6 @@
 """What became of a function, to look at: jaxpr, annotated form, instructions, machine code, and what was in the way."""
 
 import dataclasses
-from typing import Any
 
 from jax.extend.core import ClosedJaxpr
 

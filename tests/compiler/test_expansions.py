@@ -10,7 +10,7 @@ import pytest
 from dae_jax.compiler import jit
 
 
-SIZES = [1, 2, 3, 4, 6]
+SIZES = [1, 2, 3, 6, 8]
 DTYPES = [np.float64, np.float32, np.complex128]
 
 
@@ -47,11 +47,11 @@ def test_factorisations_of_every_type(dtype):
 
     is_complex = np.issubdtype(dtype, np.complexfloating)
     fn = (lambda a, s: jax.lax.linalg.lu(a)) if is_complex else all_of_them
-    for n in (3,) if is_complex else (3, 6):
+    for n in (3,) if is_complex else (3, 8):
         assert_expanded(fn, matrix(n, n, dtype=dtype), hermitian(n, dtype))
 
 
-@pytest.mark.parametrize("shape", [(3, 2), (2, 3), (2, 7), (7, 3), (2, 2, 3, 3), (3, 5, 5)])
+@pytest.mark.parametrize("shape", [(3, 2), (2, 3), (2, 7), (9, 3), (2, 2, 3, 3), (3, 7, 7)])
 def test_any_shape(shape):
     assert_expanded(lambda a: (jax.lax.linalg.lu(a), jnp.linalg.qr(a)), matrix(*shape))
 
@@ -61,7 +61,7 @@ def test_full_qr():
     assert_expanded(lambda a: jnp.linalg.qr(a, mode="complete"), matrix(3, 5))
 
 
-@pytest.mark.parametrize("n", [3, 6])
+@pytest.mark.parametrize("n", [3, 8])
 def test_singular_and_indefinite(n):
     singular = np.ones((n, n))
     assert_expanded(jax.lax.linalg.lu, singular)
@@ -71,7 +71,7 @@ def test_singular_and_indefinite(n):
     assert_expanded(lambda a: jnp.isnan(jnp.linalg.solve(a, jnp.ones(n))).any(), np.full((n, n), np.nan))
 
 
-@pytest.mark.parametrize("n", [3, 6])
+@pytest.mark.parametrize("n", [3, 8])
 @pytest.mark.parametrize("flags", list(itertools.product([False, True], repeat=4)))
 def test_triangular_systems(n, flags):
     left_side, lower, transpose_a, unit_diagonal = flags
@@ -87,7 +87,7 @@ def test_triangular_systems(n, flags):
 def test_large_ones_are_left_to_lapack():
     found = jit(lambda a: jnp.linalg.inv(a)).lower(np.eye(100))
     assert found.compiler == "xla"
-    assert "of more than 64 rows or columns" in str(found)
+    assert "of more than 32 rows or columns" in str(found)
 
 
 NUMBERS = np.array([3.0, np.nan, -0.0, 0.0, np.inf, -np.inf, 1.0, 1.0, -2.5])
@@ -108,6 +108,6 @@ def test_sorting_by_several_keys_along_an_axis():
     x = np.arange(12.0)[::-1].reshape(4, 3) % 5
     for a, b in zip(jit(fn)(x), jax.jit(fn)(x), strict=True):
         np.testing.assert_array_equal(a, b)
-    long = np.random.default_rng(0).normal(size=300).round(1)
+    long = np.random.default_rng(0).normal(size=200).round(1)
     np.testing.assert_array_equal(jit(jnp.argsort)(long), jax.jit(jnp.argsort)(long))
     assert "sort of more than" in str(jit(jnp.sort).lower(np.zeros(5000)))

@@ -87,7 +87,7 @@ class TestTransformations:
         assert_same(jax.jit(REVERSE[name](jit(fn)))(X), jax.jit(REVERSE[name](fn))(X), rtol=1e-10)
 
     def test_reverse_of_an_open_loop_is_refused_as_jax_refuses_it(self):
-        with pytest.raises(ValueError, match="Reverse-mode differentiation does not work for lax.while_loop"):
+        with pytest.raises(ValueError, match="Reverse-mode differentiation does not work"):
             jax.grad(total(jit(open_loop)))(X)
 
     def test_outside_of_a_jit(self, only_ours):
@@ -125,11 +125,11 @@ class TestCalls:
         class Scaled:
             factor = 3.0
 
-            @jit
-            def of(x):  # noqa: N805
-                return 2 * x
+            @functools.partial(jit, static_argnums=0)
+            def of(self, x):
+                return self.factor * x
 
-        assert Scaled.of(X)[0] == pytest.approx(0.6)
+        assert_same(Scaled().of(X), 3 * X)
 
     def test_named_and_documented_as_the_function(self):
         def something(x):

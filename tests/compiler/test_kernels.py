@@ -13,7 +13,6 @@ import dae_jax
 from dae_jax.compiler import configure, hindrances, one_kernel, polynomials, scalarise, subroutine, xla_kernel
 from dae_jax.compiler.emit import programs
 from dae_jax.compiler.jaxprs.scalar_interpreter import Unsupported
-from dae_jax.compiler.lower import module
 
 
 def length(x):
