@@ -56,7 +56,7 @@ def _lu_written_out(a: Any) -> tuple[Any, Any, Any]:
             top, row = [*rows[k], order[k]], [*rows[i], order[i]]
             *rows[k], order[k] = [jnp.where(swap, y, x) for x, y in zip(top, row, strict=True)]
             *rows[i], order[i] = [jnp.where(swap, x, y) for x, y in zip(top, row, strict=True)]
-        by = jnp.where(rows[k][k] == 0, 1, rows[k][k])
+        by = jnp.where(_size(rows[k][k]) == 0, 1, rows[k][k])
         for i in range(k + 1, m):
             factor = rows[i][k] / by
             rows[i] = [*rows[i][:k], factor, *(x - factor * y for x, y in zip(rows[i][k + 1 :], rows[k][k + 1 :], strict=True))]
@@ -75,7 +75,7 @@ def _lu_in_loop(a: Any) -> tuple[Any, Any, Any]:
         pivot = jnp.argmax(jnp.where(row >= k, sizes, -1)).astype(jnp.int32)
         swapped = jnp.where(row == k, pivot, jnp.where(row == pivot, k, row))
         a, order = a[swapped], order[swapped]
-        by = jnp.where(a[k, k] == 0, 1, a[k, k])
+        by = jnp.where(_size(a[k, k]) == 0, 1, a[k, k])
         factors = jnp.where(row > k, a[:, k] / by, 0)
         a = a - factors[:, None] * jnp.where(column > k, a[k], 0)
         a = jnp.where((column == k) & (row[:, None] > k), factors[:, None], a)
