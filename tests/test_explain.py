@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import dae_jax
-from dae_jax.compiler import kernel_call
+from dae_jax.compiler import equations, kernel_call
+from dae_jax.compiler.lower import module
 from dae_jax.scenes import SCENES, chain
 from tests.methods import METHODS, Method
 
@@ -58,6 +59,63 @@ def test_every_method_is_compiled_by_our_compiler(method, monkeypatch):
     jax.jit(jax.vmap(solve)).lower(jax.tree.map(lambda x: jnp.stack([x] * 9), scene.y0))
 
 
+PAIRS = {
+    "pendulum, projected": (lambda: SCENES["pendulum"](), PROJECTED, {}),
+    "pendulum, plain": (lambda: SCENES["pendulum"](), diffrax.Tsit5(), {}),
+    "pendulum, tangent space": (lambda: SCENES["pendulum"](), dae_jax.TangentSpace(dae_jax.DOP853()), {}),
+    "pendulum, Baumgarte": (
+        lambda: SCENES["pendulum"](), diffrax.Dopri5(), {"formulation": dae_jax.Baumgarte(alpha=5.0, beta=5.0)},
+    ),
+    "pendulum, dummy derivatives": (
+        lambda: SCENES["pendulum"](), dae_jax.BDF(), {"formulation": dae_jax.DummyDerivatives()},
+    ),
+    "double pendulum, BDF": (lambda: SCENES["double-pendulum"](), dae_jax.BDF(), {}),
+    "four bars": (lambda: SCENES["four-bar-redundant"](), PROJECTED, {}),
+    "robertson, Radau": (lambda: SCENES["robertson"](), dae_jax.RadauIIA5(), {}),
+    "robertson, Kvaerno": (lambda: SCENES["robertson"](), diffrax.Kvaerno5(), {}),
+    "car axis, Radau": (lambda: SCENES["car-axis"](), dae_jax.RadauIIA5(), {}),
+    "robertson, Kvaerno3": (lambda: SCENES["robertson"](), diffrax.Kvaerno3(), {}),
+    "amplifier, BDF": (lambda: SCENES["amplifier"](), dae_jax.BDF(), {}),
+}  # fmt: skip
+
+
+def who_compiles(monkeypatch, fn, *args):
+    """Which compiler the kernel with the loop went to; "xla" where there is none. No machine code is made."""
+    found = []
+    by_llvm = kernel_call._by_llvm
+
+    def noted(jaxpr, lanes, args):
+        out = by_llvm(jaxpr, lanes, args)
+        if any(eqn.primitive.name == "while" and eqn.params["body_nconsts"] for eqn in equations(jaxpr)):
+            found.append("llvm" if out is not None else "xla")
+        return out
+
+    monkeypatch.setattr(kernel_call, "_by_llvm", noted)
+    monkeypatch.setattr(module, "register", lambda *_: "dae_jax_none")
+    jax.jit(fn).lower(*args)
+    return found[0] if found else "xla"
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_what_is_predicted_is_what_happens(name, monkeypatch):
+    make, solver, options = PAIRS[name]
+    scene = make()
+    plans = []
+
+    def solve(y):
+        plans.append(dae_jax.explain(scene.system, solver, 0.0, y, scene.args, **options))
+        return dae_jax.daesolve(scene.system, solver, 0.0, 1.0, None, y, scene.args, **options).ys
+
+    y0 = jax.tree.map(jnp.asarray, scene.y0)
+    alone = who_compiles(monkeypatch, solve, y0)
+    found = plans[0]
+    assert alone == ("llvm" if found.compiler == "llvm" else "xla")
+    batch = jax.tree.map(lambda x: jnp.stack([x] * 9), y0)
+    lanes = who_compiles(monkeypatch, jax.vmap(solve), batch)
+    assert lanes == found.batch_compiler
+    assert (found.compiler != "llvm" or found.batch_compiler != "llvm") == bool(found.reasons)
+
+
 def test_a_mesh_does_not_hinder(monkeypatch):
     """Under a mesh JAX writes down for each number how it is spread out, which is no arithmetic."""
     system = dae_jax.SemiExplicitDAE(lambda t, x, z, k: -k * x * z, lambda t, x, z, k: z - jnp.ones_like(x))
@@ -77,7 +135,7 @@ def test_names_the_primitive_that_prevents_it():
     assert not found.one_kernel
     assert found.hindrances == ("eigh",)
     assert (found.constraints, found.independent) == (4, 3)
-    assert "no: eigh" in str(found)
+    assert "no, XLA as it is; `eigh` has no rule" in str(found)
 
 
 def test_switched_off():

@@ -9,7 +9,7 @@ from .jaxprs.scalarise import scalarise as scalarise
 from .jaxprs.unchecked import without_checks as without_checks
 from .jaxprs.walk import equations as equations, is_large as is_large
 from .jit import Jitted as Jitted, jit as jit
-from .kernel_call import Decision as Decision, decision as decision
+from .kernel_call import Decision as Decision, decision as decision, hindrances as hindrances
 from .one_kernel import (
     PullBack as PullBack,
     inexact as inexact,

@@ -3,9 +3,11 @@
 Beside it XLA's interface for foreign functions, which has a version (`emit/interface.py`).
 """
 
+import inspect
 from typing import Any
 
 import jax
+import numpy as np
 from jax._src import xla_bridge
 from jax.interpreters.partial_eval import dce_jaxpr as dce_jaxpr
 
@@ -29,3 +31,20 @@ def is_check(eqn: Any) -> bool:
         return False
     callback = getattr(eqn.params["callback"], "callback_func", None)
     return getattr(callback, "__module__", None) == "equinox._errors"
+
+
+def is_key(aval: Any) -> bool:
+    """Whether an array is one of random keys."""
+    dtype = getattr(aval, "dtype", bool)
+    return not isinstance(dtype, np.dtype | type) and jax.numpy.issubdtype(dtype, jax.dtypes.prng_key)
+
+
+def key_functions(dtype: Any) -> Any:
+    """The generator of a type of keys: its `key_shape`, `seed`, `split`, `fold_in`, `random_bits`, of the numbers of a key."""
+    return dtype._impl
+
+
+def check_messages(eqn: Any) -> list[str] | None:
+    """The messages of such a call, one of which it raises, by its only operand; `None` where they are not found."""
+    messages = inspect.getclosurevars(eqn.params["callback"].callback_func).nonlocals.get("msgs")
+    return list(messages) if messages is not None and len(eqn.invars) == 1 else None

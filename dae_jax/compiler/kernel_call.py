@@ -48,6 +48,12 @@ def decision(jaxpr: ClosedJaxpr, lanes: Sequence[bool] = ()) -> Decision:
     return _decided(kernel, tuple(b for b, u in zip(lanes, used, strict=True) if u) if lanes else ())
 
 
+def hindrances(jaxpr: ClosedJaxpr) -> tuple[str, ...]:
+    """The names of the primitives in `jaxpr`, at any depth, that keep it from being one kernel; empty if none does."""
+    found = decision(jaxpr)
+    return tuple(dict.fromkeys(x.primitive for x in found.unsupported)) if found.compiler == "xla" else ()
+
+
 def _decided(kernel: ClosedJaxpr, lanes: tuple[bool, ...]) -> Decision:
     if current().compiler != "llvm":
         found = (Unsupported(f"our compiler is switched off: `compiler={current().compiler!r}`"),)

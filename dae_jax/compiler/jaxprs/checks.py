@@ -3,14 +3,13 @@
 Machine code cannot raise. It tells instead which check failed first, and who called it raises.
 """
 
-import inspect
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr
-from jax.interpreters.partial_eval import dce_jaxpr
 
+from .._compat import check_messages, dce_jaxpr, is_check
 from .rewriting import Rewriting
 from .scalar_interpreter import Unsupported
 from .walk import equations
@@ -50,13 +49,13 @@ def _without_error(eqn: Any, args: list[Any]) -> tuple[list[str], Any, Any]:
     """The messages of a check, which of them it would give, and whether it fails."""
     (bad,) = (b for b in eqn.params["branches"] if _raising(b) is not None)
     raising = _raising(bad)
-    messages = inspect.getclosurevars(raising.params["callback"].callback_func).nonlocals.get("msgs")
-    if messages is None or len(raising.invars) != 1:
+    messages = check_messages(raising)
+    if messages is None:
         raise Unsupported("a check whose message is not known")
     before = bad.jaxpr.eqns[: bad.jaxpr.eqns.index(raising)]
     chooses = bad.jaxpr.replace(eqns=before, outvars=raising.invars)
     (index,) = jax.core.eval_jaxpr(chooses, bad.consts, *args[1:])
-    return list(messages), index, args[0] == eqn.params["branches"].index(bad)
+    return messages, index, args[0] == eqn.params["branches"].index(bad)
 
 
 def _is_check(eqn: Any) -> bool:
@@ -73,11 +72,4 @@ def _passing(eqn: Any) -> ClosedJaxpr:
 
 def _raising(branch: ClosedJaxpr) -> Any:
     """The equation that raises."""
-    return next(filter(_of_equinox, branch.jaxpr.eqns), None)
-
-
-def _of_equinox(eqn: Any) -> bool:
-    if eqn.primitive.name != "pure_callback":
-        return False
-    callback = getattr(eqn.params["callback"], "callback_func", None)
-    return getattr(callback, "__module__", None) == "equinox._errors"
+    return next(filter(is_check, branch.jaxpr.eqns), None)

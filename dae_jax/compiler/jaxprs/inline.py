@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
 
 from .scalar_interpreter import CALLS as OF_CALLS
+from .special_functions import SPECIAL, by_simpler_ones
 
 
 CALLS = {**OF_CALLS, "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "custom_vmap_call": "call"}
@@ -21,7 +22,6 @@ _GIVES = {
 _BY_OTHERS = frozenset({"unvmap_any", "unvmap_all", "maybe_set"})
 _SAME_IF_SO_SHAPED = frozenset({"reshape", "broadcast_in_dim", "convert_element_type", "squeeze", "expand_dims"})
 _COMMUTATIVE = frozenset({"add", "add_any", "mul", "max", "min", "and", "or", "xor", "eq", "ne"})
-KNOWN = CALLS.keys() | _GIVES.keys() | _BY_OTHERS | {"custom_linear_solve"}
 
 
 def inlined(closed: ClosedJaxpr) -> ClosedJaxpr:
@@ -62,6 +62,8 @@ class _Flat:
             return self.run(inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ()), args)
         if name in _GIVES:
             return [args[_GIVES[name]]]
+        if name in SPECIAL:
+            return self.run(by_simpler_ones(eqn), args)
         if name == "custom_linear_solve":
             return self.run(p["jaxprs"].solve, of_solve(p, args))
         if name in _BY_OTHERS:
@@ -126,7 +128,7 @@ def _key(params: Any) -> Hashable:
 
 def _atom(x: Any) -> Hashable:
     # By its text: 0 and −0 are equal, and not the same.
-    return (repr(x.val), str(x.aval)) if isinstance(x, Literal) else x
+    return (repr(x.val), x.aval.dtype) if isinstance(x, Literal) else x
 
 
 def _meaning(eqn: Any) -> ClosedJaxpr:

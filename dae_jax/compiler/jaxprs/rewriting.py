@@ -42,6 +42,9 @@ class Rewriting:
         name, p = eqn.primitive.name, eqn.params
         if self._applies(eqn):
             return self._replacement(eqn, args, state)
+        if name == "cond" and not isinstance(args[0], jax.core.Tracer):
+            branch = p["branches"][int(args[0])]
+            return self.run(branch.jaxpr, branch.consts, args[1:], state)
         if not any(map(self._applies, equations_in(eqn))):
             results = eqn.primitive.bind(*args, **eqn.primitive.get_bind_params(p))
             return results if eqn.primitive.multiple_results else [results], state

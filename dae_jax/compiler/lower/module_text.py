@@ -50,8 +50,9 @@ class _Module:
             self._store(self.lowering.run(self.jaxpr, self._arguments(None)), None, None)
         found = [line for k in range(len(ins)) for line in buffer("%args", k, f"arg{k}")]
         found += [line for k in range(len(outs)) for line in buffer("%results", k, f"result{k}")]
-        found += self._heap()
-        body = [*found, *memory.stack, "br label %start", "start:", *code.lines]
+        taken, given_back = self._heap()
+        # What is on the stack belongs into the first block: elsewhere LLVM keeps none of it in registers.
+        body = [*found, *memory.stack, *taken, "br label %start", "start:", *code.lines, *given_back]
         functions = (
             in_threads(body, self._find_batch(), code.width)
             if lanes
@@ -59,22 +60,22 @@ class _Module:
         )
         return "\n".join([*memory.constants, *code.declared.values(), *functions])
 
-    def _heap(self) -> list[str]:
-        """The instructions that take the memory of all arrays at once."""
+    def _find_batch(self) -> list[str]:
+        """The instructions that find the size of the batch."""
+        first = self.batched.index(True)
+        return [*buffer("%args", first, f"arg{first}"), *batch_size(f"arg{first}")]
+
+    def _heap(self) -> tuple[list[str], list[str]]:
+        """The instructions that take the memory of all arrays that are not on the stack, and that give it back."""
         code, size = self.code, self.memory.heap
         if size > THRESHOLDS.heap_bytes and self.limit < np.inf:
             raise TooLarge
         if not size:
-            return []
+            return [], []
         code.function("malloc", "ptr", "i64")
         code.function("free", "void", "ptr")
         taken, given_back = heap(size)
-        code.lines += given_back
-        return taken
-
-    def _find_batch(self) -> list[str]:
-        first = self.batched.index(True)
-        return [*buffer("%args", first, f"arg{first}"), *batch_size(f"arg{first}")]
+        return [*taken, *self.memory.on_heap], given_back
 
     def _arguments(self, row: Value | None) -> list[Any]:
         """The arguments, of the element that each lane has."""

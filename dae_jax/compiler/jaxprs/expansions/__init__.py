@@ -8,6 +8,8 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jax.extend.core import ClosedJaxpr
 
 from ..rewriting import Rewriting
@@ -18,12 +20,23 @@ from .sorting import sort
 from .triangular import triangular_solve
 
 
+def _platform_index(*, platforms: Any, **_: Any) -> np.int32:
+    """Which of several implementations is for the CPU."""
+    return np.int32(next(i for i, names in enumerate(platforms) if names is None or "cpu" in names))
+
+
+def _empty(*, dtype: Any, **_: Any) -> Any:
+    return jnp.zeros((), dtype)
+
+
 EXPANSIONS: dict[str, Callable[..., Any]] = {
     "cholesky": cholesky,
+    "empty2": _empty,
     "geqrf": geqrf,
     "householder_product": householder_product,
     "lu": lu,
     "lu_pivots_to_permutation": lu_pivots_to_permutation,
+    "platform_index": _platform_index,
     "qr": qr,
     "sort": sort,
     "triangular_solve": triangular_solve,

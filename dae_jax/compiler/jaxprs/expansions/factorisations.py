@@ -6,19 +6,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from ...thresholds import THRESHOLDS
 from ..scalar_interpreter import Unsupported
-
-
-# Up to this size every entry is a number of its own. TODO measured
-WRITTEN_OUT = 4
-# LAPACK's blocks are faster above.
-LARGEST = 64
 
 
 def refuse_large(name: str, *sizes: int) -> None:
     """Raises `Unsupported` for matrices that are LAPACK's."""
-    if max(sizes) > LARGEST:
-        raise Unsupported(f"{name} of more than {LARGEST} rows or columns")
+    if max(sizes) > THRESHOLDS.largest_matrix:
+        raise Unsupported(f"{name} of more than {THRESHOLDS.largest_matrix} rows or columns")
 
 
 def of_batch(fn: Callable[..., Any], batch: int) -> Callable[..., Any]:
@@ -28,7 +23,7 @@ def of_batch(fn: Callable[..., Any], batch: int) -> Callable[..., Any]:
     return fn
 
 
-def lu(a: Any, *, pivot_size: int | None = None, **_: Any) -> tuple[Any, Any, Any]:
+def lu(a: Any, **_: Any) -> tuple[Any, Any, Any]:
     """L and U in one matrix, the rows that were exchanged, and the permutation; as LAPACK's getrf.
 
     A column of zeros is no pivot and stays as it is.
@@ -37,7 +32,7 @@ def lu(a: Any, *, pivot_size: int | None = None, **_: Any) -> tuple[Any, Any, An
     refuse_large("lu", m, n)
     if not m * n:
         raise Unsupported("lu of an empty matrix")
-    return of_batch(_lu_written_out if max(m, n) <= WRITTEN_OUT else _lu_in_loop, a.ndim - 2)(a)
+    return of_batch(_lu_written_out if max(m, n) <= THRESHOLDS.matrix_written_out else _lu_in_loop, a.ndim - 2)(a)
 
 
 def _size(x: Any) -> Any:
@@ -61,7 +56,7 @@ def _lu_written_out(a: Any) -> tuple[Any, Any, Any]:
             top, row = [*rows[k], order[k]], [*rows[i], order[i]]
             *rows[k], order[k] = [jnp.where(swap, y, x) for x, y in zip(top, row, strict=True)]
             *rows[i], order[i] = [jnp.where(swap, x, y) for x, y in zip(top, row, strict=True)]
-        by = jnp.where(rows[k][k] == 0, 1, rows[k][k])
+        by = jnp.where(_size(rows[k][k]) == 0, 1, rows[k][k])
         for i in range(k + 1, m):
             factor = rows[i][k] / by
             rows[i] = [*rows[i][:k], factor, *(x - factor * y for x, y in zip(rows[i][k + 1 :], rows[k][k + 1 :], strict=True))]
@@ -80,7 +75,7 @@ def _lu_in_loop(a: Any) -> tuple[Any, Any, Any]:
         pivot = jnp.argmax(jnp.where(row >= k, sizes, -1)).astype(jnp.int32)
         swapped = jnp.where(row == k, pivot, jnp.where(row == pivot, k, row))
         a, order = a[swapped], order[swapped]
-        by = jnp.where(a[k, k] == 0, 1, a[k, k])
+        by = jnp.where(_size(a[k, k]) == 0, 1, a[k, k])
         factors = jnp.where(row > k, a[:, k] / by, 0)
         a = a - factors[:, None] * jnp.where(column > k, a[k], 0)
         a = jnp.where((column == k) & (row[:, None] > k), factors[:, None], a)
@@ -110,7 +105,7 @@ def cholesky(a: Any, **_: Any) -> Any:
     """L with L Lᴴ = a, of its lower half; not a number where a is not positive definite."""
     refuse_large("cholesky", a.shape[-1])
     n = a.shape[-1]
-    return of_batch(_cholesky_written_out if n <= WRITTEN_OUT else _cholesky_in_loop, a.ndim - 2)(a)
+    return of_batch(_cholesky_written_out if n <= THRESHOLDS.matrix_written_out else _cholesky_in_loop, a.ndim - 2)(a)
 
 
 def _cholesky_written_out(a: Any) -> Any:

@@ -5,19 +5,16 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from ...thresholds import THRESHOLDS
 from ..scalar_interpreter import Unsupported
 from .factorisations import of_batch
-
-
-# All pairs are compared.
-LONGEST = 1024
 
 
 def sort(*operands: Any, dimension: int, num_keys: int, **_: Any) -> list[Any]:
     """The operands in the order of the first so many of them; equal entries stay in their order, NaN comes last."""
     n = operands[0].shape[dimension]
-    if n > LONGEST:
-        raise Unsupported(f"sort of more than {LONGEST} entries")
+    if n > THRESHOLDS.longest_sort:
+        raise Unsupported(f"sort of more than {THRESHOLDS.longest_sort} entries")
     last = [jnp.moveaxis(x, dimension, -1) for x in operands]
 
     def in_order(*xs: Any) -> list[Any]:

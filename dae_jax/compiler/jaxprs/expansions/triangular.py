@@ -5,7 +5,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from .factorisations import WRITTEN_OUT, of_batch, refuse_large
+from ...thresholds import THRESHOLDS
+from .factorisations import of_batch, refuse_large
 
 
 def triangular_solve(
@@ -30,7 +31,7 @@ def triangular_solve(
         forwards = lower != transposed
         if not forwards:
             a, b = a[::-1, ::-1], b[::-1]
-        x = (_written_out if len(a) <= WRITTEN_OUT else _in_loop)(a, b, unit_diagonal)
+        x = (_written_out if len(a) <= THRESHOLDS.matrix_written_out else _in_loop)(a, b, unit_diagonal)
         x = x if forwards else x[::-1]
         return x if left_side else x.T
 

@@ -1,0 +1,113 @@
+"""What stands in a kernel for LAPACK's factorisations, and for sorting, gives what JAX gives."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dae_jax.compiler import jit
+
+
+SIZES = [1, 2, 3, 6, 8]
+DTYPES = [np.float64, np.float32, np.complex128]
+
+
+def matrix(*shape, dtype=np.float64):
+    rng = np.random.default_rng(len(shape) + shape[-1])
+    parts = rng.normal(size=(2, *shape))
+    return (parts[0] + 1j * parts[1] if np.issubdtype(dtype, np.complexfloating) else parts[0]).astype(dtype)
+
+
+def hermitian(n, dtype):
+    a = matrix(n, n, dtype=dtype)
+    return a @ a.conj().T + np.eye(n, dtype=dtype)
+
+
+def assert_expanded(fn, *args):
+    """The function is compiled by us, and gives what JAX gives."""
+    assert jit(fn).lower(*args).compiler == "llvm"
+    for x, y in zip(jax.tree.leaves(jit(fn)(*args)), jax.tree.leaves(jax.jit(fn)(*args)), strict=True):
+        assert x.dtype == y.dtype
+        scale = np.max(np.abs(y), initial=0, where=np.isfinite(y)) if y.dtype.kind in "fc" else 0
+        np.testing.assert_allclose(x, y, rtol=0, atol=1e4 * scale * np.finfo(y.dtype).eps if scale else 0)
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_lu_and_what_is_made_of_it(n):
+    a, b = matrix(n, n), matrix(n)
+    assert_expanded(lambda a, b: (*jax.lax.linalg.lu(a), jnp.linalg.solve(a, b), jnp.linalg.inv(a), jnp.linalg.det(a)), a, b)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_factorisations_of_every_type(dtype):
+    def all_of_them(a, s):
+        return jax.lax.linalg.lu(a), jnp.linalg.cholesky(s), jnp.linalg.qr(a), jnp.linalg.solve(s, a)
+
+    is_complex = np.issubdtype(dtype, np.complexfloating)
+    fn = (lambda a, s: jax.lax.linalg.lu(a)) if is_complex else all_of_them
+    for n in (3, 8):
+        assert_expanded(fn, matrix(n, n, dtype=dtype), hermitian(n, dtype))
+
+
+@pytest.mark.parametrize("shape", [(3, 2), (2, 3), (2, 7), (9, 3), (2, 2, 3, 3), (3, 7, 7)])
+def test_any_shape(shape):
+    assert_expanded(lambda a: (jax.lax.linalg.lu(a), jnp.linalg.qr(a)), matrix(*shape))
+
+
+def test_full_qr():
+    assert_expanded(lambda a: jnp.linalg.qr(a, mode="complete"), matrix(5, 3))
+    assert_expanded(lambda a: jnp.linalg.qr(a, mode="complete"), matrix(3, 5))
+
+
+@pytest.mark.parametrize("n", [3, 8])
+def test_singular_and_indefinite(n):
+    singular = np.ones((n, n))
+    assert_expanded(jax.lax.linalg.lu, singular)
+    assert_expanded(jax.lax.linalg.lu, np.zeros((n, n)))
+    assert_expanded(lambda a: jnp.isnan(jnp.linalg.cholesky(a)), -np.eye(n))
+    assert_expanded(lambda a: jnp.isnan(jnp.linalg.cholesky(a)), np.full((n, n), np.nan))
+    assert_expanded(lambda a: jnp.isnan(jnp.linalg.solve(a, jnp.ones(n))).any(), np.full((n, n), np.nan))
+
+
+@pytest.mark.parametrize("n", [3, 8])
+@pytest.mark.parametrize("flags", list(itertools.product([False, True], repeat=4)))
+def test_triangular_systems(n, flags):
+    left_side, lower, transpose_a, unit_diagonal = flags
+    solve = lambda a, b: jax.lax.linalg.triangular_solve(
+        a, b, left_side=left_side, lower=lower, transpose_a=transpose_a, unit_diagonal=unit_diagonal
+    )
+    # What is not part of the triangle is not looked at.
+    a = matrix(n, n) + np.where(np.tri(n, dtype=bool) == lower, 0, np.nan) + 2 * np.eye(n)
+    np.fill_diagonal(a, 2.0)
+    assert_expanded(solve, a, matrix(n, 2) if left_side else matrix(2, n))
+
+
+def test_large_ones_are_left_to_lapack():
+    found = jit(lambda a: jnp.linalg.inv(a)).lower(np.eye(100))
+    assert found.compiler == "xla"
+    assert "of more than 32 rows or columns" in str(found)
+
+
+NUMBERS = np.array([3.0, np.nan, -0.0, 0.0, np.inf, -np.inf, 1.0, 1.0, -2.5])
+
+
+@pytest.mark.parametrize(
+    "x",
+    [NUMBERS, NUMBERS.astype(np.float32), np.array([1, 2**31 + 5, 7], np.uint32), np.array([3, -1, 2]), np.array([True, False])],
+)
+def test_sorting_in_every_order(x):
+    for fn in (jnp.sort, jnp.argsort, lambda x: jnp.sort(x, descending=True)):
+        np.testing.assert_array_equal(jit(fn)(x), jax.jit(fn)(x))
+    assert jit(jnp.sort).lower(x).compiler == "llvm"
+
+
+def test_sorting_by_several_keys_along_an_axis():
+    fn = lambda x: jax.lax.sort((x // 2, x, jnp.broadcast_to(jnp.arange(3.0), x.shape)), dimension=0, num_keys=2)
+    x = np.arange(12.0)[::-1].reshape(4, 3) % 5
+    for a, b in zip(jit(fn)(x), jax.jit(fn)(x), strict=True):
+        np.testing.assert_array_equal(a, b)
+    long = np.random.default_rng(0).normal(size=200).round(1)
+    np.testing.assert_array_equal(jit(jnp.argsort)(long), jax.jit(jnp.argsort)(long))
+    assert "sort of more than" in str(jit(jnp.sort).lower(np.zeros(5000)))
