@@ -22,7 +22,7 @@ class Thresholds:
 
     Control flow:
     - `written_out`: equations up to which a loop of a known number of turns is written out.
-    - `compaction`: what an exchange of lanes costs, in turns of the loop of all lanes.
+    - `compaction`: what a compaction of lanes costs, in turns of the loop of all lanes.
 
     Factorisations and sorting, which stand for LAPACK's and for XLA's:
     - `matrix_written_out`: rows up to which a factorisation has every entry in a register. Systems of 4 and of 8 unknowns take 0.09

@@ -152,7 +152,12 @@ def test_many_complex_numbers():
         z = (x + 0.03j * x[::-1]).reshape(10, 6)
         return [f(w) for w in (jnp.prod(z), jnp.prod(z, 1), jnp.cumprod(z, 0), z**-2, jnp.square(z)) for f in (jnp.real, jnp.imag)]
 
+    def equal(x, y):
+        z = x + 1j * y
+        return [f(w, w[::-1]) for w in (z, z[:4]) for f in (jnp.equal, jnp.not_equal)]
+
     same(fn, np.random.default_rng(0).uniform(0.5, 0.8, (LANES, 60)), ulps=10_000)
+    same(equal, *np.random.default_rng(0).integers(0, 2, (2, LANES, 60)).astype(float))
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
