@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix
 
+from ._compat import trace_state_is_clean
 from .checks import is_saved_part, saved_parts
 from .compiler import PullBack, inexact, one_kernel, one_kernel_enabled, waiting
 from .formulations import AbstractFormulation, Residual
@@ -80,8 +81,23 @@ class _Split(eqx.Module):
         return eqx.combine(self.numbers, self.rest)
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1))
-def _jitted(program: Program, rank: int | Rank | None, arrays: list[Any]) -> Any:
+# How many problems stay compiled. Each holds 8 MB and more, most of it in JAX's caches of what it has traced.
+KEPT = 32
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _compiled(program: Program, rank: int | Rank | None) -> Callable[[list[Any]], Any]:
+    """A problem, jitted by itself, so that those that were not used for longest are let go.
+
+    JAX and equinox keep the traces of thousands of problems, by functions that stay: after so many new ones they are told to
+    forget them.
+    """
+    if trace_state_is_clean() and _compiled.cache_info().misses % KEPT == 0:
+        jax.clear_caches()
+    return jax.jit(functools.partial(_traced, program, rank))
+
+
+def _traced(program: Program, rank: int | Rank | None, arrays: list[Any]) -> Any:
     solve, *inputs = program.inputs(jax.tree.map(jnp.asarray, arrays))
     waiting.begin(always=not isinstance(solve.progress_meter, diffrax.NoProgressMeter))
     solve.refuse_wrong_functions(*inputs)
@@ -101,7 +117,7 @@ def _numbers(program: Program, rank: int | Rank | None, arrays: list[Any]) -> _S
 def run(program: Program, rank: int | Rank | None, arrays: list[Any]) -> tuple[DAESolution, Any, float]:
     """The solution, whether the start was consistent and of the given rank, and the seconds spent on compiling this."""
     try:
-        sol, as_expected = _jitted(program, rank, arrays)
+        sol, as_expected = _compiled(program, rank)(arrays)
     finally:
         seconds = waiting.end()
     return sol.whole(), as_expected, seconds
