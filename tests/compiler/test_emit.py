@@ -20,6 +20,12 @@ def header():
     return re.sub(r"_XLA_FFI_API_STRUCT_FIELD\((\w+)\);", r"void* \1;", text)
 
 
+def found_in(text, pattern):
+    found = re.search(pattern, text, re.DOTALL)
+    assert found, pattern
+    return found[1]
+
+
 class TestInterface:
     """The offsets are those of the header that comes with JAX."""
 
@@ -27,7 +33,7 @@ class TestInterface:
 
     def layout(self, header, name):
         """Offset of each field, alignment, and size."""
-        body = re.search(rf"struct {name} {{(.*?)}}", header, re.DOTALL)[1]
+        body = found_in(header, rf"struct {name} {{(.*?)}}")
         body = re.sub(r"void \(\*(\w+)\)\([^)]*\)", r"void* \1", body)
         offsets, at, widest = {}, 0, 1
         for kind, field in re.findall(r"([\w\s]+?\**)\s*(\w+);", body):
@@ -58,16 +64,16 @@ class TestInterface:
         last = re.search(rf"XLA_FFI_DEFINE_STRUCT_TRAITS\({name}, (\w+)\)", header)
         if "" in interface.OFFSETS[name]:
             field = last[1] if last else list(found)[-1]
-            kind = re.search(rf"struct {name} {{.*?([\w*]+)\s+{field};", header, re.DOTALL)[1]
+            kind = found_in(header, rf"struct {name} {{.*?([\w*]+)\s+{field};")
             assert interface.OFFSETS[name][""] == found[field] + self.size(header, kind)[0]
 
     def test_numbers(self, header):
         for name, number in interface.NUMBERS.items():
-            assert int(re.search(rf"{name} = (\d+)", header)[1]) == number
+            assert int(found_in(header, rf"{name} = (\d+)")) == number
 
     def test_version(self, header):
         """Where this fails, look at what changed in the header before changing `VERSION`."""
-        found = tuple(int(re.search(rf"XLA_FFI_API_{part} (\d+)", header)[1]) for part in ("MAJOR", "MINOR"))
+        found = tuple(int(found_in(header, rf"XLA_FFI_API_{part} (\d+)")) for part in ("MAJOR", "MINOR"))
         assert found >= interface.VERSION
         assert found[0] == interface.VERSION[0]
 

@@ -179,7 +179,7 @@ def _load_again(slot: int) -> int:
     """Called by the handler of a program whose code was let go; 0 where it cannot be loaded."""
     with _lock:
         program = next((p for p in _programs.values() if p.slot == slot), None)
-        if program is None:
+        if program is None or program.place is None:
             return 0
         if program.engine is None:
             file, start = program.place
