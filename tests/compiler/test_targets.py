@@ -34,6 +34,14 @@ class TestTargets:
                     np.testing.assert_allclose(x, y, rtol=1e-13)
         assert widths[-1] == target.vector_size()
 
+    def test_the_same_function_is_written_for_each(self):
+        jaxpr = jax.make_jaxpr(slow)(1.0)
+        wide = written(jaxpr, (True,))
+        with configure(isa="sse2"):
+            assert "<2 x double>" in written(jaxpr, (True,))
+        assert written(jaxpr, (True,)) == wide
+        assert f"<{target.vector_size()} x double>" in wide
+
     def test_sse2_has_nothing_of_avx(self, tmp_path):
         with configure(isa="sse2", dump=tmp_path):
             jax.jit(jax.vmap(one_kernel(slow, "forward")))(np.linspace(0, 1, 11))
@@ -83,13 +91,12 @@ class TestTargets:
             return True
 
         monkeypatch.setattr(vector_math, "host", lambda: other)
-        monkeypatch.setattr(module, "vector_size", lambda: other.width)
         monkeypatch.setattr(instructions, "vector_size", lambda: other.width)
         monkeypatch.setattr(instructions, "has_symbol", looked_up)
         monkeypatch.setattr(runtime, "has_symbol", looked_up)
         table = lambda x: (jnp.arange(400.0) * x[0]).at[3].set(jnp.cbrt(x[1]))
         jaxpr = jax.make_jaxpr(lambda x: (slow(x), jnp.power(x[0], x[1]), table(x)))(X)
-        text = written.__wrapped__(jaxpr, (True,) if lanes else ()).replace("{name}", "f")
+        text = module._written.__wrapped__(jaxpr, (True,) if lanes else (), False, other).replace("{name}", "f")
         assert "_ZGV" not in text or "linux" in triple
         own = {"malloc", "free", runtime.SHARE, runtime.HANDLE, "memset", "memcpy", "memmove", "bzero"}
         for module_text, passes in ((text, True), (runtime.text(), False), (runtime.stubs(), False)):

@@ -12,7 +12,7 @@ from jax.extend.core import ClosedJaxpr, Literal
 from ..emit import available, register
 from ..emit.interface import batch_size, buffer
 from ..emit.runtime import alone, heap, in_threads
-from ..emit.target import vector_size
+from ..emit.target import Target, host
 from ..jaxprs.inline import inlined
 from ..jaxprs.numbers import on_numbers
 from ..jaxprs.scalar_interpreter import Unsupported
@@ -69,25 +69,29 @@ def _has_kind(aval: Any) -> bool:
     return dtype == jax.dtypes.float0 or (dtype is not None and np.dtype(dtype).name in KINDS)
 
 
-@functools.lru_cache(maxsize=2)
 def written(jaxpr: ClosedJaxpr, batched: tuple[bool, ...] = (), always_copies: bool = False) -> str:
     """The module whose function `{name}.kernel` computes the outputs from the inputs.
 
     With `batched` inputs the function is that of a batch: these inputs, and all outputs, have a leading axis of any
     length. `always_copies`: nothing is updated in place, and no memory used twice. Raises `Unsupported` for what cannot be written.
     """
+    return _written(jaxpr, batched, always_copies, host())
+
+
+@functools.lru_cache(maxsize=2)
+def _written(jaxpr: ClosedJaxpr, batched: tuple[bool, ...], always_copies: bool, target: Target) -> str:
     jaxpr = inlined(jaxpr)
     place = main_loop(jaxpr) if any(batched) else None
     if place is not None:
         with contextlib.suppress(Unsupported):
-            return _Module(jaxpr, batched, always_copies).text(place)
-    return _Module(jaxpr, batched, always_copies).text(None)
+            return _Module(jaxpr, batched, always_copies, target.width).text(place)
+    return _Module(jaxpr, batched, always_copies, target.width).text(None)
 
 
 class _Module:
-    def __init__(self, jaxpr: ClosedJaxpr, batched: Sequence[bool], always_copies: bool) -> None:
+    def __init__(self, jaxpr: ClosedJaxpr, batched: Sequence[bool], always_copies: bool, width: int) -> None:
         self.jaxpr, self.batched = jaxpr, list(batched) or [False] * len(jaxpr.jaxpr.invars)
-        self.code = Memory(vector_size() if any(batched) else 1, always_copies)
+        self.code = Memory(width if any(batched) else 1, always_copies)
         self.run = Control(self.code, LIMIT)
 
     def text(self, place: int | None) -> str:
