@@ -83,21 +83,19 @@ class _Split(eqx.Module):
 
 # How many problems stay compiled. Each holds 8 MB and more, most of it in JAX's caches of what it has traced.
 KEPT = 32
+_traced: list[Program] = []
 
 
-@functools.lru_cache(maxsize=KEPT)
-def _compiled(program: Program, rank: int | Rank | None) -> Callable[[list[Any]], Any]:
-    """A problem, jitted by itself, so that those that were not used for longest are let go.
-
-    JAX and equinox keep the traces of thousands of problems, by functions that stay: after so many new ones they are told to
-    forget them.
-    """
-    if trace_state_is_clean() and _compiled.cache_info().misses % KEPT == 0:
+def _make_room() -> None:
+    """JAX and equinox keep the traces of thousands of problems: after so many new ones they are told to forget them."""
+    if len(_traced) >= KEPT and trace_state_is_clean():
+        _traced.clear()
         jax.clear_caches()
-    return jax.jit(functools.partial(_traced, program, rank))
 
 
-def _traced(program: Program, rank: int | Rank | None, arrays: list[Any]) -> Any:
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _jitted(program: Program, rank: int | Rank | None, arrays: list[Any]) -> Any:
+    _traced.append(program)
     solve, *inputs = program.inputs(jax.tree.map(jnp.asarray, arrays))
     waiting.begin(always=not isinstance(solve.progress_meter, diffrax.NoProgressMeter))
     solve.refuse_wrong_functions(*inputs)
@@ -116,8 +114,9 @@ def _numbers(program: Program, rank: int | Rank | None, arrays: list[Any]) -> _S
 
 def run(program: Program, rank: int | Rank | None, arrays: list[Any]) -> tuple[DAESolution, Any, float]:
     """The solution, whether the start was consistent and of the given rank, and the seconds spent on compiling this."""
+    _make_room()
     try:
-        sol, as_expected = _compiled(program, rank)(arrays)
+        sol, as_expected = _jitted(program, rank, arrays)
     finally:
         seconds = waiting.end()
     return sol.whole(), as_expected, seconds
