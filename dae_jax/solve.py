@@ -12,7 +12,7 @@ import numpy as np
 from .driver.failures import OKAY, in_words, raised_in_the_program
 from .driver.options import refuse_misfits, refuse_no_event, refuse_other_steps, refuse_wrong_options
 from .driver.problem import Problem, Program, split
-from .driver.program import Solve, run
+from .driver.program import KEPT, Solve, run
 from .driver.resets import Jump, refuse_other_outputs
 from .driver.start import as_array, checked, refuse_bad_start, refuse_bad_times
 from .formulations import (
@@ -167,13 +167,20 @@ def _run_on_numbers(program: Program, arrays: list[Any], solve: Solve, problem: 
     if inside or not as_expected:
         with jax.ensure_compile_time_eval():
             rank = refuse_bad_start(*problem.start, solve.formulation.inverts_mass)
-        _of_known_rank[program], _ = split((solve, dataclasses.replace(problem, rank=rank)))
-        if _of_known_rank[program] != known:
-            sol, _, more = run(_of_known_rank[program], arrays)
+        better, _ = split((solve, dataclasses.replace(problem, rank=rank)))
+        _remember(program, better)
+        if better != known:
+            sol, _, more = run(better, arrays)
             seconds += more
     if not inside:
         sol.stats["compile_seconds"] = seconds
     return sol
+
+
+def _remember(program: Program, better: Program) -> None:
+    _of_known_rank[program] = better
+    for oldest in list(_of_known_rank)[:-KEPT]:
+        _of_known_rank.pop(oldest, None)
 
 
 def _default_controller(dt0: Any, dtype: Any) -> Any:

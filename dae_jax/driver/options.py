@@ -8,8 +8,8 @@ import diffrax
 import jax
 import numpy as np
 import optimistix
-from diffrax._root_finder import use_stepsize_tol
 
+from .._compat import use_stepsize_tol
 from ..formulations import AbstractFormulation, AbstractResidualFormulation
 from ..solvers import AbstractManifoldSolver, is_explicit, takes_residuals
 from ..validate.states import NUMBERS, brief

@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from .._compat import trace_state_is_clean
 from ..compiler import PullBack, inexact, one_kernel, waiting
 from ..consistent import look_at_end, look_at_start
 from ..equations.regularity import COARSE
@@ -25,8 +26,21 @@ from .start import saved_parts
 from .trajectory_adjoint import Taped, can_be_taped, cotangents, recorded, saved_times
 
 
+# How many problems stay compiled. Each holds 8 MB and more, most of it in JAX's caches of what it has traced.
+KEPT = 128
+_traced: list[Program] = []
+
+
+def _make_room() -> None:
+    """JAX and equinox keep the traces of thousands of problems: after so many new ones they are told to forget them."""
+    if len(_traced) >= KEPT and trace_state_is_clean():
+        _traced.clear()
+        jax.clear_caches()
+
+
 @functools.partial(jax.jit, static_argnums=0)
 def _jitted(program: Program, arrays: list[Any]) -> Any:
+    _traced.append(program)
     solve, problem = program.whole(jax.tree.map(jnp.asarray, arrays))
     waiting.begin(always=not isinstance(solve.progress_meter, diffrax.NoProgressMeter))
     solve.refuse_wrong_functions(problem)
@@ -45,6 +59,7 @@ def run(program: Program, arrays: list[Any]) -> tuple[DAESolution, Any, float]:
     """The solution of (`Solve`, `Problem`), whether the start was consistent and of the given rank, and the seconds spent on
     compiling this.
     """
+    _make_room()
     try:
         sol, as_expected = _jitted(program, arrays)
     finally:
