@@ -1,0 +1,45 @@
+"""Which programs are run, many compiled together."""
+
+from collections.abc import Iterable, Iterator, Sequence
+
+from dae_jax.compiler.jaxprs.scalar_interpreter import Unsupported
+
+from .check import differences
+from .numbers import Draw
+from .programs import CLAIMED, Program, composed, single
+from .shrink import shrunk
+
+
+# As many compile together; more take LLVM longer than each by itself.
+TOGETHER = 24
+COMPOSED = 300
+
+
+def of_seed(seed: int) -> Iterator[Program]:
+    """One for each primitive on each type of numbers, and compositions."""
+    order = Draw(seed).order(len(CLAIMED))
+    yield from (single(*CLAIMED[k], seed) for k in order)
+    yield from (composed(COMPOSED * seed + k, copies=k % 3 == 0) for k in range(COMPOSED))
+
+
+def bundles(programs: Iterable[Program]) -> Iterator[list[Program]]:
+    """Such as take copies by themselves, of compositions a few."""
+    waiting: dict[tuple[bool, bool], list[Program]] = {}
+    for program in programs:
+        kind = program.copies, len(program.operands) == 4 and program.name.startswith("composed")
+        waiting.setdefault(kind, []).append(program)
+        if len(waiting[kind]) == (TOGETHER // 4 if kind[1] else TOGETHER):
+            yield waiting.pop(kind)
+    yield from waiting.values()
+
+
+def report(programs: Sequence[Program]) -> list[str]:
+    """What is wrong with them: of each program the smallest part that differs, or why it cannot be compiled."""
+    try:
+        found = differences(programs)
+    except Exception as error:
+        if len(programs) > 1:
+            return [line for half in (programs[::2], programs[1::2]) for line in report(half)]
+        what = f"{type(error).__name__} {error}".splitlines()[0][:300]
+        return [f"{programs[0].name}: {'refused' if isinstance(error, Unsupported) else 'fails'}: {what}"]
+    return [f"{d}\n{shrunk(d)}" for d in {d.program.name: d for d in found[::-1]}.values()]
