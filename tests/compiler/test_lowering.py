@@ -1,5 +1,7 @@
 """What our compiler makes of a function gives what JAX gives: one element, and lanes."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,9 +12,9 @@ from dae_jax.compiler.emit import machine
 from dae_jax.compiler.emit.machine import vector_size
 from dae_jax.compiler.jaxprs.inline import inlined
 from dae_jax.compiler.jaxprs.scalar_interpreter import Unsupported
-from dae_jax.compiler.lower import compiled, hindrances, module as compiler
+from dae_jax.compiler.lower import annotate, compiled, hindrances, unsupported, written
 from dae_jax.compiler.lower.lane_queue import main_loop
-from dae_jax.compiler.lower.module import written
+from dae_jax.compiler.thresholds import THRESHOLDS
 
 
 X = np.array([1.0, 2.0, -3.0])
@@ -254,13 +256,27 @@ def test_what_is_written_once_is_not_kept_beyond_a_branch():
 
 
 @pytest.mark.parametrize(
-    ("fn", "name"),
-    [(jnp.sort, "sort"), (lambda x: x.astype(jnp.float16), "convert_element_type"), (jax.lax.digamma, "digamma")],
-)
-def test_hindrances(fn, name):
+    ("fn", "name", "sentence"),
+    [
+        (jnp.fft.fft, "fft", "`fft` has no rule: c128[3] = fft c128[3]"),
+        (
+            lambda x: x.astype(jnp.float16), "convert_element_type",
+            "float16 is no type of number that is compiled: f16[3] = convert_element_type f64[3]",
+        ),
+        (jax.lax.digamma, "digamma", "`digamma` has no rule: f64[3] = digamma f64[3]"),
+        (
+            lambda x: jax.lax.while_loop(lambda c: jnp.abs(c[0]) < 3, lambda c: jnp.exp(c), x[:1] + 0j).real, "exp",
+            "`exp` of complex128 is not written: c128[1] = exp c128[1]",
+        ),
+        (lambda x: jax.debug.callback(print, x), "debug_callback", "`debug_callback` has side effects: = debug_callback f64[3]"),
+    ],
+)  # fmt: skip
+def test_what_is_not_compiled_is_said(fn, name, sentence):
     jaxpr = jax.make_jaxpr(fn)(X)
     assert name in hindrances(jaxpr)
-    with pytest.raises((Unsupported, KeyError)):
+    assert sentence in list(map(str, unsupported(jaxpr)))
+    assert str(annotate(jaxpr)) == str(unsupported(jaxpr)[0])
+    with pytest.raises(Unsupported):
         written(jaxpr, ())
 
 
@@ -270,7 +286,7 @@ def test_too_large(monkeypatch):
             x = jnp.sin(x) + x[::-1]
         return x
 
-    monkeypatch.setattr(compiler, "LIMIT", 1000)
+    monkeypatch.setattr("dae_jax.compiler.lower.judge.THRESHOLDS", dataclasses.replace(THRESHOLDS, instructions=1000))
     assert hindrances(jax.make_jaxpr(fn)(jnp.arange(100.0))) == ("size",)
 
 

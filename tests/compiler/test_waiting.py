@@ -1,5 +1,6 @@
 """What keeps the first answer from being waited for: what is compiled, by whom, and that it is said."""
 
+import dataclasses
 import sys
 from typing import ClassVar
 
@@ -11,11 +12,10 @@ import pytest
 
 import dae_jax
 from dae_jax import scenes
-from dae_jax.compiler import waiting, without_checks, xla_kernel
+from dae_jax.compiler import equations, waiting, without_checks, xla_kernel
 from dae_jax.compiler.emit import machine
-from dae_jax.compiler.lower import compiled, hindrances, module as compiler
-from dae_jax.compiler.lower.arrays import SMALL
-from dae_jax.compiler.lower.cost import extent
+from dae_jax.compiler.lower import annotate, compiled, hindrances
+from dae_jax.compiler.thresholds import THRESHOLDS
 from dae_jax.solve import prepared
 
 
@@ -28,16 +28,17 @@ def repeated(x, count):
     return x
 
 
-class TestExtent:
+class TestCost:
     def test_what_moves_entries_takes_nothing(self):
         moving = jax.make_jaxpr(lambda x: jnp.stack([x[::-1], x]).T.reshape(-1)[2:])(X)
-        assert extent(moving, [False])[0] == 0
+        assert annotate(moving).cost == 0
 
     def test_what_is_known_is_not_written(self, monkeypatch):
         """The estimate knows of no zeros: between one and four times the limit the function is written to see."""
-        monkeypatch.setattr(compiler, "LIMIT", 500)
+        lowered = dataclasses.replace(THRESHOLDS, instructions=500)
+        monkeypatch.setattr("dae_jax.compiler.lower.judge.THRESHOLDS", lowered)
         jaxpr = jax.make_jaxpr(lambda x: repeated(x, 10) + repeated(jnp.zeros(16), 30))(jnp.arange(16.0))
-        assert extent(jaxpr, [False])[0] > compiler.LIMIT
+        assert annotate(jaxpr).cost > 500
         assert hindrances(jaxpr) == ()
         assert hindrances(jax.make_jaxpr(lambda x: repeated(x, 40))(jnp.arange(16.0))) == ("size",)
 
@@ -160,7 +161,7 @@ def test_inside_jit_there_is_no_time_to_tell():
 
 
 def test_dummy_derivatives_of_a_mechanism_are_not_left_to_xla():
-    """The double pendulum: estimated at more than is allowed, half of it zeros, with factorials in it."""
+    """The double pendulum: as it is traced it has more equations than are allowed, half of them there twice, and factorials."""
     scene = scenes.double_pendulum()
     solve, *inputs = prepared(
         scene.system, diffrax.Tsit5(), 0.0, 1.0, None, scene.y0, None, dae_jax.DummyDerivatives(),
@@ -168,5 +169,5 @@ def test_dummy_derivatives_of_a_mechanism_are_not_left_to_xla():
     )  # fmt: skip
     kernel, arrays = solve.kernel(*inputs, None)
     jaxpr = jax.make_jaxpr(without_checks(kernel))(arrays)
-    assert extent(jaxpr, [v.aval.size > SMALL for v in jaxpr.jaxpr.invars])[0] > compiler.LIMIT
+    assert sum(v.aval.size for eqn in equations(jaxpr) for v in eqn.outvars) > THRESHOLDS.instructions
     assert hindrances(jaxpr) == ()

@@ -12,7 +12,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from .scalar_interpreter import ScalarInterpreter, Unsupported, is_number, objects
+from .objects import is_number, objects
+from .scalar_interpreter import ScalarInterpreter, Unsupported
 
 
 # Operations on polynomials, about 3 µs each.
@@ -73,7 +74,7 @@ class _Polynomials(ScalarInterpreter):
         self.operations += 1
         name, params, dtype = eqn.primitive.name, eqn.params, eqn.outvars[0].aval.dtype
         if np.issubdtype(dtype, np.complexfloating):
-            raise Unsupported
+            raise Unsupported("complex numbers are no polynomials")
         if not np.issubdtype(dtype, np.floating):
             return self.function(eqn, x)
         match name:

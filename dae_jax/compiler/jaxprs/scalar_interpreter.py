@@ -5,7 +5,6 @@ polynomial) and what arithmetic on it means is up to its subclasses.
 """
 
 import functools
-import math
 import operator
 from collections.abc import Callable
 from typing import Any
@@ -15,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 
-from .gathers import gathered, scattered
+from .movement import MOVEMENTS, dynamic_slice, gather, scatter
 from .numbers import converted, on_numbers
+from .objects import are_known, columns, is_number, objects
 
 
 ELEMENTWISE = frozenset(
@@ -24,11 +24,8 @@ ELEMENTWISE = frozenset(
     "erf erf_inv erfc exp exp2 expm1 floor ge gt integer_pow is_finite le lgamma log log1p logistic lt max min mul ne "
     "neg nextafter not or pow rem round rsqrt select_n sign sin sinh sqrt square sub tan tanh xor".split()
 )
-STRUCTURAL = frozenset(
-    "add_any broadcast_in_dim concatenate copy copy_p dot_general dynamic_slice expand_dims gather iota pad reduce_max "
-    "reduce_sum reshape rev slice split squeeze stack stop_gradient tile transpose".split()
-)
-_SCATTERS = {"scatter": None, "scatter-add": "total"}
+_AT_PLACES = frozenset({"dynamic_slice", "gather", "scatter", "scatter-add"})
+_COMBINING = frozenset({"add_any", "dot_general", "reduce_max", "reduce_sum"})
 CALLS = {
     "closed_call": "call_jaxpr",
     "jit": "jaxpr",
@@ -41,31 +38,11 @@ _OPAQUE = frozenset({"custom_jvp_call", "custom_vjp_call"})
 
 
 class Unsupported(Exception):
-    """The function has a primitive without such a form, or is too large."""
+    """Why a function cannot be written so: the reason in words, and where there is one the equation in short and its primitive."""
 
-
-def objects(entries: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """A list as an array of objects."""
-    out = np.empty(len(entries), dtype=object)
-    for i, entry in enumerate(entries):  # `out[:] = entries` would ask traced entries for their values
-        out[i] = entry
-    return out.reshape(shape)
-
-
-def is_number(x: Any, *which: float) -> bool:
-    """Whether an entry is known while tracing, and one of `which` where these are given."""
-    return isinstance(x, np.generic) and (not which or any(x == value for value in which))
-
-
-def columns(x: np.ndarray, axes: tuple[int, ...]) -> np.ndarray:
-    """An array with these axes as its first one."""
-    x = np.moveaxis(x, axes, range(len(axes)))
-    return x.reshape((math.prod(x.shape[: len(axes)]), *x.shape[len(axes) :]))
-
-
-def as_indices(x: np.ndarray) -> np.ndarray:
-    """Known entries as integers of 64 bits; what is too large for one is the largest."""
-    return np.array([min(int(i), np.iinfo(np.int64).max) for i in x.ravel()], np.int64).reshape(x.shape)
+    def __init__(self, reason: str, equation: str = "", primitive: str = "") -> None:
+        super().__init__(f"{reason}: {equation}" if equation else reason)
+        self.reason, self.equation, self.primitive = reason, equation, primitive
 
 
 class ScalarInterpreter:
@@ -118,7 +95,7 @@ class ScalarInterpreter:
             values = self.equation(eqn, [read(v) for v in eqn.invars])
             env.update(zip(eqn.outvars, values, strict=True))
             if self.operations > self.limit:
-                raise Unsupported
+                raise Unsupported("too many operations")
         return [read(v) for v in jaxpr.outvars]
 
     def constant(self, x: Any) -> np.ndarray:
@@ -134,7 +111,7 @@ class ScalarInterpreter:
         if name == "dot_general":
             sizes.append(sizes[0] * int(np.prod([args[0].shape[i] for i in eqn.params["dimension_numbers"][0][0]])))
         if max(sizes, default=0) > self.limit:
-            raise Unsupported
+            raise Unsupported("too many entries")
         if name in CALLS:
             inner = params[CALLS[name]]
             if not isinstance(inner, ClosedJaxpr):
@@ -144,11 +121,14 @@ class ScalarInterpreter:
             return self.opaque(eqn, args)
         if name in ELEMENTWISE:
             return [self.elementwise(eqn, args)]
-        if name in _SCATTERS:
-            return [self.scatter(eqn, args)]
-        if name not in STRUCTURAL:
-            raise Unsupported
-        out = getattr(self, name)(eqn, args)
+        if name in MOVEMENTS:
+            out = MOVEMENTS[name](eqn, *args)
+        elif name in _AT_PLACES:
+            out = self._at_places(eqn, args)
+        elif name in _COMBINING:
+            out = getattr(self, name)(eqn, args)
+        else:
+            raise Unsupported(f"`{name}` of entries is not known")
         return out if isinstance(out, list) else [out]
 
     def elementwise(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
@@ -195,7 +175,7 @@ class ScalarInterpreter:
     def reduced(self, eqn: Any, x: np.ndarray, combine: Callable[[Any, Any], Any], identity: float) -> np.ndarray:
         dtype = eqn.outvars[0].aval.dtype
         if identity and not jnp.issubdtype(dtype, jnp.floating):
-            raise Unsupported
+            raise Unsupported("the maximum of numbers other than floats is not known")
         x = columns(x, eqn.params["axes"])
         first = np.asarray(identity, dtype)[()]
         return objects(
@@ -218,97 +198,19 @@ class ScalarInterpreter:
         ]
         return objects(out, aval.shape)
 
-    # Data movement
-
-    def reshape(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
-        return args[0].reshape(eqn.outvars[0].aval.shape)
-
-    squeeze = expand_dims = reshape
-
-    def copy(self, _: Any, args: list[np.ndarray]) -> np.ndarray:
-        return args[0]
-
-    stop_gradient = copy_p = copy
-
-    def broadcast_in_dim(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
-        shape, dimensions = eqn.params["shape"], eqn.params["broadcast_dimensions"]
-        inner = [1] * len(shape)
-        for size, dimension in zip(args[0].shape, dimensions, strict=True):
-            inner[dimension] = size
-        return np.broadcast_to(args[0].reshape(inner), shape)
-
-    def transpose(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
-        return np.transpose(args[0], eqn.params["permutation"])
-
-    def tile(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
-        return np.tile(args[0], eqn.params["reps"])
-
-    def rev(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
-        return np.flip(args[0], eqn.params["dimensions"])
-
-    def slice(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
-        p = eqn.params
-        strides = p["strides"] or (1,) * args[0].ndim
-        return args[0][tuple(map(slice, p["start_indices"], p["limit_indices"], strides))]
-
-    def split(self, eqn: Any, args: list[np.ndarray]) -> list[np.ndarray]:
-        return np.split(args[0], np.cumsum(eqn.params["sizes"])[:-1], axis=eqn.params["axis"])
-
     def add_any(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
         return objects(list(map(self.total, *(a.ravel() for a in args))), eqn.outvars[0].aval.shape)
 
-    def stack(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
-        return np.stack(args, axis=eqn.params["axis"])
-
-    def concatenate(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
-        return np.concatenate(args, axis=eqn.params["dimension"])
-
-    def iota(self, eqn: Any, _: list[np.ndarray]) -> np.ndarray:
-        shape, dimension = eqn.params["shape"], eqn.params["dimension"]
-        along = np.arange(shape[dimension]).astype(eqn.params["dtype"])
-        along = along.reshape([-1 if i == dimension else 1 for i in range(len(shape))])
-        return self.constant(np.broadcast_to(along, shape))
-
-    def pad(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
-        x, fill = args
-        config = eqn.params["padding_config"]
-        if any(low < 0 or high < 0 for low, high, _ in config):
-            raise Unsupported
-        out = np.empty(eqn.outvars[0].aval.shape, dtype=object)
-        out[...] = fill[()]
-        out[tuple(slice(low, out.shape[i] - high, gap + 1) for i, (low, high, gap) in enumerate(config))] = x
-        return out
-
-    def gather(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
-        x, indices = args
-        if not all(is_number(i) for i in indices.ravel()):
-            raise Unsupported
-        p, places = eqn.params, np.arange(x.size).reshape(x.shape)
-        moved = gathered(places, as_indices(indices), p["dimension_numbers"], p["slice_sizes"], p["mode"])
-        if (moved < 0).any():
-            raise Unsupported
-        return objects(x.ravel()[moved.ravel()], moved.shape)
-
-    def dynamic_slice(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
-        x, starts = args[0], [a[()] for a in args[1:]]
-        if not all(map(is_number, starts)):
-            raise Unsupported
-        sizes = eqn.params["slice_sizes"]
-        first = [min(max(int(s), 0), d - k) for s, d, k in zip(starts, x.shape, sizes, strict=True)]
-        return x[tuple(slice(s, s + k) for s, k in zip(first, sizes, strict=True))]
-
-    def scatter(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
-        x, indices, updates = args
-        if not all(map(is_number, indices.ravel())):
-            raise Unsupported
-        p, places = eqn.params, np.arange(x.size).reshape(x.shape)
-        moved = scattered(places, as_indices(indices), updates.shape, p["dimension_numbers"], p["mode"])
-        combine = _SCATTERS[eqn.primitive.name]
-        out = x.ravel().copy()
-        for place, update in zip(moved.ravel(), updates.ravel(), strict=True):
-            if place >= 0:
-                out[place] = getattr(self, combine)(out[place], update) if combine else update
-        return out.reshape(x.shape)
+    def _at_places(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
+        """What reads or writes at places, which must be known."""
+        name = eqn.primitive.name
+        if not all(map(are_known, args[1:2] if name != "dynamic_slice" else args[1:])):
+            raise Unsupported(f"`{name}` at a place that is not known")
+        if name == "dynamic_slice":
+            return dynamic_slice(eqn, *args)
+        if name == "gather":
+            return gather(eqn, *args)
+        return scatter(eqn, *args, combine=self.total if name == "scatter-add" else lambda _, update: update)
 
 
 def _matrices(x: np.ndarray, batch: tuple[int, ...], contract: tuple[int, ...]) -> np.ndarray:

@@ -19,7 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import jaxpr_as_fun
 
-from .scalar_interpreter import ScalarInterpreter, Unsupported, is_number, objects
+from .objects import is_number, objects
+from .scalar_interpreter import ScalarInterpreter, Unsupported
 
 
 # Above this many scalar operations straight-line code costs more to compile than it saves at run time.

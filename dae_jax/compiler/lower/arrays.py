@@ -7,7 +7,7 @@ Who may write into whose memory, in the order in which instructions are run:
 
 1. Who reads a buffer later refers to it: each variable of a frame that holds an array, and a loop, to what it reads at
    each turn. A buffer is written to by who made it, and then by an update (or a loop that carries it on) whose operand it
-   is, once nothing refers to it (`Places.own`). With lanes each writes to the lanes that take part only.
+   is, once nothing refers to it (`Memory.own`). With lanes each writes to the lanes that take part only.
 2. A buffer is used for another array (`Memory.recycle`) when nothing refers to it and nothing holds it. What is read by
    instructions that are written now and run again or later is held: what a loop carries, the operands of branches.
 3. Memory is taken before the first instruction that is run between its first and its last use is written. So it is none
@@ -22,10 +22,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-
-
-# More entries than these are kept in memory where a loop carries them, and where an operation makes them.
-SMALL = 24
 
 
 @dataclasses.dataclass(eq=False)

@@ -6,20 +6,15 @@ from typing import Any
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal, Var
 
-from ..jaxprs.scalar_interpreter import Unsupported
+from ..thresholds import THRESHOLDS
 from .operands import retain
-from .primitives import Primitives
-
-
-# More operations than these in one loop would nest our own calls too deep.
-DEEP = 40
 
 
 class Environment:
     """How far it has been run, and the values that are still needed."""
 
-    def __init__(self, run: Primitives, closed: ClosedJaxpr, args: list[Any]) -> None:
-        self.run, self.jaxpr = run, closed.jaxpr
+    def __init__(self, lowering: Any, closed: ClosedJaxpr, args: list[Any]) -> None:
+        self.lowering, self.jaxpr = lowering, closed.jaxpr
         self.values: dict[Any, Any] = {}
         self._let_go: dict[Any, None] = {}
         self._last: dict[Any, int] = {}
@@ -29,17 +24,21 @@ class Environment:
             self._last.update((v, i) for v in eqn.invars if isinstance(v, Var))
         self._last.update((v, len(self.jaxpr.eqns)) for v in self.jaxpr.outvars if isinstance(v, Var))
         self._bind(self.jaxpr.invars, args, -1)
-        self._bind(self.jaxpr.constvars, list(map(run.constant, closed.consts)), -1)
+        self._bind(self.jaxpr.constvars, list(map(lowering.constant, closed.consts)), -1)
 
     def _bind(self, variables: Any, values: list[Any], now: int) -> None:
         for v, x in zip(variables, values, strict=True):
             if self._last.get(v, -1) > now:
-                x = self.run.code.materialised(x) if self._uses[v] > 1 or getattr(x, "depth", 0) > DEEP else x
+                x = (
+                    self.lowering.memory.materialised(x)
+                    if self._uses[v] > 1 or getattr(x, "depth", 0) > THRESHOLDS.fused_depth
+                    else x
+                )
                 self.values[v] = x
                 retain(x, 1)
 
     def _read(self, v: Any) -> Any:
-        return self.run.constant(np.asarray(v.val, v.aval.dtype)) if isinstance(v, Literal) else self.values[v]
+        return self.lowering.constant(np.asarray(v.val, v.aval.dtype)) if isinstance(v, Literal) else self.values[v]
 
     def operands(self, i: int) -> list[Any]:
         """The operands of equation i; those that nothing else needs are let go."""
@@ -53,15 +52,13 @@ class Environment:
     def give(self, i: int, values: list[Any]) -> None:
         """The results of equation i."""
         self._bind(self.jaxpr.eqns[i].outvars, values, i)
-        self.run.code.recycle(self._let_go)
+        self.lowering.memory.recycle(self._let_go)
         self._let_go.clear()
 
     def advance(self, start: int, stop: int) -> None:
         """Runs the equations from `start` to `stop`."""
         for i in range(start, stop):
-            self.give(i, self.run.equation(self.jaxpr.eqns[i], self.operands(i)))
-            if len(self.run.code.lines) > self.run.limit:
-                raise Unsupported("too many instructions")
+            self.give(i, self.lowering.equation(self.jaxpr.eqns[i], self.operands(i)))
 
     def results(self) -> list[Any]:
         """What the jaxpr returns, when all of it has been run."""

@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..emit.machine import has_symbol, vector_function, vector_size
-from ..jaxprs.scalar_interpreter import Unsupported
+from ..emit.machine import vector_function, vector_size
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -34,36 +33,17 @@ class Complex:
     imag: Any
 
 
-KINDS = {
-    "float64": "double", "float32": "float", "bool": "i1", "int8": "i8", "uint8": "i8", "int16": "i16",
-    "uint16": "i16", "int32": "i32", "uint32": "i32", "int64": "i64", "uint64": "i64",
-    "complex64": "", "complex128": "",
-}  # fmt: skip
-BYTES = {"double": 8, "float": 4, "i1": 1, "i8": 1, "i16": 2, "i32": 4, "i64": 8}
-
-
-def kind_of(dtype: Any) -> str:
-    """The LLVM type of a number."""
-    kind = KINDS.get(np.dtype(dtype).name)
-    if not kind:
-        raise Unsupported(str(dtype))
-    return kind
-
-
-def parts_of(dtype: Any) -> tuple[str, int]:
-    """The LLVM type of the parts of a number, and how many it has."""
-    dtype = np.dtype(dtype)
-    return (kind_of(f"float{4 * dtype.itemsize}"), 2) if dtype.kind == "c" else (kind_of(dtype), 1)
-
-
 class Instructions:
-    """A function's instructions, written one after another."""
+    """A function's instructions, written one after another; `mask` says which lanes take part, all where it is `None`."""
 
     def __init__(self, width: int = 1) -> None:
         self.width = width
+        self.mask: Value | None = None
         self.lines: list[str] = []
         self.declared: dict[str, str] = {}
         self.block = "entry"
+        # The turns of the longest loop over an array.
+        self.longest = 0
         self._count = 0
         self._known: ChainMap[str, Value] = ChainMap()
         self._scaled: dict[str, tuple[Value, float]] = {}
@@ -144,6 +124,28 @@ class Instructions:
         self.declared[name] = f"declare {result} @{name}({', '.join(kinds)})"
         return f"@{name}"
 
+    # Blocks
+
+    def label(self, name: str) -> None:
+        """A block begins."""
+        self.lines.append(f"{name}:")
+        self.block = name
+
+    def jump(self, name: str) -> None:
+        """A block ends, and the one of this name comes next."""
+        self.lines.append(f"br label %{name}")
+
+    def branch(self, condition: Any, yes: str, no: str) -> None:
+        """A block ends, and one of two comes next."""
+        self.lines.append(f"br i1 {condition.name}, label %{yes}, label %{no}")
+
+    @contextlib.contextmanager
+    def unmasked(self) -> Iterator[None]:
+        """All lanes take part: for memory that nothing else sees yet."""
+        mask, self.mask = self.mask, None
+        yield
+        self.mask = mask
+
     # Instructions
 
     def op(self, code: str, kind: str, *xs: Any, result: str | None = None) -> Value:
@@ -177,8 +179,6 @@ class Instructions:
     def library(self, name: str, kind: str, *xs: Any) -> Value:
         """A function of the C library, lane by lane where it has none for vectors."""
         name = name if kind == "double" else f"{name}f"
-        if not has_symbol(name):
-            raise Unsupported(name)
         function = self.function(name, kind, *[kind] * len(xs))
         call = lambda ys: self.pure(
             f"call {kind} {function}({', '.join(self.operand(y, kind) for y in ys)})", kind, False
@@ -237,6 +237,23 @@ class Instructions:
         return self.pure(
             f"select {which}, {self.operand(yes, kind, lanes)}, {self.operand(no, kind, lanes)}", kind, lanes
         )
+
+    def times(self, a: Any, b: Any) -> Any:
+        """The product of two indices."""
+        if isinstance(a, int) and isinstance(b, int):
+            return a * b
+        if isinstance(a, int) or isinstance(b, int):
+            number, value = (a, b) if isinstance(a, int) else (b, a)
+            return 0 if number == 0 else value if number == 1 else self.op("mul", "i64", value, number)
+        return self.op("mul", "i64", a, b)
+
+    def plus(self, a: Any, b: Any) -> Any:
+        """The sum of two indices."""
+        if isinstance(a, int) and isinstance(b, int):
+            return a + b
+        if isinstance(a, int) and a == 0:
+            return b
+        return a if isinstance(b, int) and b == 0 else self.op("add", "i64", a, b)
 
     def copy(self, x: Any, kind: str) -> Value:
         """A value in any case."""

@@ -12,20 +12,21 @@ from typing import Any
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from ..jaxprs.scalar_interpreter import Unsupported, objects
+from ..jaxprs.objects import objects
 from ..jaxprs.walk import equations, equations_in
-from .arrays import SMALL, View
-from .control import Control
+from ..thresholds import THRESHOLDS
+from .arrays import View
+from .carry import kept_apart
+from .dtypes import kinds_of
 from .environment import Environment
 from .instructions import Complex, Value
-from .loops import kept_apart
-from .memory import Memory
-from .operands import has_lanes, kinds_of, of_texts, retain, texts
+from .lowering import Lowering
+from .operands import has_lanes, of_texts, retain, texts
 from .uniformity import varying_in_loop
 
 
-# What an exchange costs, in turns of the loop of all lanes.
-COMPACTION_THRESHOLD = 2
+class NotQueued(Exception):
+    """The lanes of this loop had better take their elements together."""
 
 
 def main_loop(jaxpr: ClosedJaxpr) -> int | None:
@@ -46,14 +47,14 @@ class LaneQueue:
 
     def __init__(
         self,
-        code: Memory,
-        run: Control,
+        lowering: Lowering,
         arguments: Callable[[Value], list[Any]],
         put: Callable[[list[Any], Value, Value], None],
         size: Value,
         last: Value,
     ) -> None:
-        self.code, self.run, self.arguments, self.put, self.size, self.last = code, run, arguments, put, size, last
+        self.lowering, self.code, self.memory = lowering, lowering.code, lowering.memory
+        self.arguments, self.put, self.size, self.last = arguments, put, size, last
         # (name, LLVM type, operand at the entry, after an exchange, after a turn) of each phi node.
         self.phis: list[list[str]] = []
 
@@ -61,10 +62,9 @@ class LaneQueue:
         """Writes the loop."""
         code = self.code
         # What is written first is run last.
-        code.recycles = False
+        self.memory.recycles = False
         head, exchange, onwards, body, done = (code.name() for _ in range(5))
-        vector = code.type("i64", True)
-        row = Value(self._phi(vector, "splat (i64 -1)"), "i64", True)
+        row = Value(self._phi(code.type("i64", True), "splat (i64 -1)"), "i64", True)
         idle = Value(self._phi("i64", "0"), "i64")
         self.free = Value(f"%{code.name()}", "i1", True)
         entered = code.block
@@ -83,35 +83,7 @@ class LaneQueue:
         code.label(head)
         here = len(code.lines)
         with code.scope():
-            n = p["cond_nconsts"]
-            alive = code.op("icmp ult", "i64", row, self.size, result="i1")
-            code.mask = alive
-            for x in (*consts, *self.carry):
-                retain(x, 1)
-            (goes_on,) = self.run.run(p["cond_jaxpr"], [*consts[:n], *self.carry])
-            for x in self.carry:
-                retain(x, -1)
-            going = code.op("and", "i1", alive, code.in_lanes(code.copy(code.entries(goes_on)[()], "i1")))
-            code.lines.append(f"{self.free.name} = xor {code.type('i1', True)} {going.name}, splat (i1 true)")
-            finished = code.op("and", "i1", alive, self.free)
-            bits = code.cast("bitcast", finished, f"i{code.width}", True)
-            waiting = code.cast("zext", code.intrinsic("ctpop", f"i{code.width}", bits), "i64")
-            idled = code.op("add", "i64", idle, waiting)
-            some, none = code.any(going), code.op("xor", "i1", code.any(going), np.True_)
-            impatient = code.op("icmp sge", "i64", idled, COMPACTION_THRESHOLD * code.width, result="i1")
-            due = code.op("and", "i1", code.any(finished), code.op("or", "i1", none, impatient))
-            fresh = code.op("icmp eq", "i64", code.lane(row, "i64", 0), -1, result="i1")
-            now = code.op("or", "i1", fresh, due)
-            code.lines.append(f"br i1 {now.name}, label %{exchange}, label %{onwards}")
-            code.label(onwards)
-            code.lines.append(f"br i1 {some.name}, label %{body}, label %{done}")
-            code.label(body)
-            code.mask = going
-            out = self.run.run(p["body_jaxpr"], [*consts[n:], *self.carry])
-            self._replace(kept_apart(code, out, self.carry, self.avals), going, 4)
-            self.phis[1][4] = idled.name
-            for x in consts:
-                retain(x, -1)
+            self._turn(p, consts, row, idle, (exchange, onwards, body, done))
             end = code.block
             code.jump(head)
         code.lines[here:here] = [
@@ -122,6 +94,44 @@ class LaneQueue:
         code.label(done)
         code.mask = None
 
+    def _turn(self, p: Any, consts: list[Any], row: Value, idle: Value, blocks: tuple[str, str, str, str]) -> None:
+        """A turn of the lanes whose condition holds, unless an exchange is due or all are done."""
+        code, n = self.code, p["cond_nconsts"]
+        exchange, onwards, body, done = blocks
+        code.mask = code.op("icmp ult", "i64", row, self.size, result="i1")
+        for x in (*consts, *self.carry):
+            retain(x, 1)
+        (goes_on,) = self.lowering.run(p["cond_jaxpr"], [*consts[:n], *self.carry])
+        for x in self.carry:
+            retain(x, -1)
+        goes_on = code.in_lanes(code.copy(self.memory.entries(goes_on)[()], "i1"))
+        going = code.op("and", "i1", code.mask, goes_on)
+        code.lines.append(f"{self.free.name} = xor {code.type('i1', True)} {going.name}, splat (i1 true)")
+        now, idled = self._exchange_due(code.mask, going, row, idle)
+        code.branch(now, exchange, onwards)
+        code.label(onwards)
+        code.branch(code.any(going), body, done)
+        code.label(body)
+        code.mask = going
+        out = self.lowering.run(p["body_jaxpr"], [*consts[n:], *self.carry])
+        self._replace(kept_apart(self.memory, out, self.carry, self.avals), going, 4)
+        self.phis[1][4] = idled.name
+        for x in consts:
+            retain(x, -1)
+
+    def _exchange_due(self, alive: Value, going: Value, row: Value, idle: Value) -> tuple[Value, Value]:
+        """Whether the waiting lanes have cost what an exchange does, and how many turns they have waited."""
+        code = self.code
+        finished = code.op("and", "i1", alive, self.free)
+        bits = code.cast("bitcast", finished, f"i{code.width}", True)
+        waiting = code.cast("zext", code.intrinsic("ctpop", f"i{code.width}", bits), "i64")
+        idled = code.op("add", "i64", idle, waiting)
+        none = code.op("xor", "i1", code.any(going), np.True_)
+        impatient = code.op("icmp sge", "i64", idled, THRESHOLDS.compaction * code.width, result="i1")
+        due = code.op("and", "i1", code.any(finished), code.op("or", "i1", none, impatient))
+        fresh = code.op("icmp eq", "i64", code.lane(row, "i64", 0), -1, result="i1")
+        return code.op("or", "i1", fresh, due), idled
+
     def _phi(self, kind: str, first: str) -> str:
         """A phi node; it keeps its value where nothing else is said."""
         self.phis.append([f"%{self.code.name()}", kind, first, "", ""])
@@ -131,10 +141,12 @@ class LaneQueue:
         code, free = self.code, self.free
         following = code.select(free, self._next(), row, "i64")
         self.phis[0][3] = following.name
-        frame = Environment(self.run, jaxpr, self.arguments(code.intrinsic("smin", "i64", following, self.last)))
-        frame.advance(0, place)
-        values, eqn = frame.operands(place), jaxpr.jaxpr.eqns[place]
-        values = list(map(code.materialised, values))
+        environment = Environment(
+            self.lowering, jaxpr, self.arguments(code.intrinsic("smin", "i64", following, self.last))
+        )
+        environment.advance(0, place)
+        values, eqn = environment.operands(place), jaxpr.jaxpr.eqns[place]
+        values = list(map(self.memory.materialised, values))
         p = eqn.params
         count = p["cond_nconsts"] + p["body_nconsts"]
         first, self.avals = values[count:], [v.aval for v in eqn.outvars]
@@ -142,18 +154,18 @@ class LaneQueue:
             list(map(has_lanes, xs)) for xs in (values[: p["cond_nconsts"]], values[p["cond_nconsts"] : count], first)
         ]
         if not all(varying_in_loop(p, own)):
-            raise Unsupported("a loop that is as long for all lanes")
+            raise NotQueued("a loop that is as long for all lanes")
         self.carry = [self._carried(aval) for aval in self.avals]
         new: list[tuple[Any, Any]] = []
         consts = [self._kept(x, new) for x in values[:count]]
-        frame.values = {v: self._kept(code.materialised(x), new) for v, x in frame.values.items()}
+        environment.values = {v: self._kept(self.memory.materialised(x), new) for v, x in environment.values.items()}
 
         # What comes after the loop, in the lanes that are done with it.
         alive = code.op("icmp ult", "i64", row, self.size, result="i1")
         code.mask = code.op("and", "i1", free, alive)
-        frame.give(place, self.carry)
-        frame.advance(place + 1, len(frame.jaxpr.eqns))
-        self.put(frame.results(), row, code.op("and", "i1", free, alive))
+        environment.give(place, self.carry)
+        environment.advance(place + 1, len(environment.jaxpr.eqns))
+        self.put(environment.results(), row, code.op("and", "i1", free, alive))
 
         code.mask = free
         for phi, x in new:
@@ -181,8 +193,8 @@ class LaneQueue:
     def _carried(self, aval: Any) -> Any:
         """What the loop carries: entries as phi nodes, large arrays in a buffer of the loop's own."""
         code = self.code
-        if aval.size > SMALL:
-            return code.new(aval.dtype, aval.shape)
+        if aval.size > THRESHOLDS.carried:
+            return self.memory.new(aval.dtype, aval.shape)
         names = [self._phi(code.type(kind, True), "zeroinitializer") for kind in kinds_of(aval)]
         return of_texts(names, aval, True)
 
@@ -190,7 +202,7 @@ class LaneQueue:
         """A value from before the loop that is needed later."""
         if isinstance(x, View):
             if x.buffer.lanes:
-                raise Unsupported("a large array from before the loop")
+                raise NotQueued("a large array from before the loop")
             return dataclasses.replace(x, offset=self._kept_part(x.offset, new))
         entries = [
             Complex(self._kept_part(e.real, new), self._kept_part(e.imag, new))
@@ -215,10 +227,12 @@ class LaneQueue:
         for aval, x, own in zip(self.avals, values, self.carry, strict=True):
             if isinstance(own, View):
                 if not (isinstance(x, View) and x.buffer is own.buffer):
-                    code.assign(own, x)
+                    self.memory.assign(own, x)
                 continue
             names = texts(code, aval, own, True)
-            for name, y, kind in zip(names, texts(code, aval, code.entries(x), True), kinds_of(aval), strict=True):
+            for name, y, kind in zip(
+                names, texts(code, aval, self.memory.entries(x), True), kinds_of(aval), strict=True
+            ):
                 vector = code.type(kind, True)
                 chosen = f"select {code.type('i1', True)} {mask.name}, {vector} {y}, {vector} {name}"
                 phis[name][edge] = name if y == name else code.pure(chosen, kind, True).name

@@ -4,17 +4,17 @@ from typing import Any
 
 import numpy as np
 
-from ..jaxprs.scalar_interpreter import Unsupported, objects
+from ..jaxprs.objects import objects
 from .arrays import View
-from .instructions import Complex, Value, parts, parts_of
-from .memory import Memory
+from .dtypes import kinds_of
+from .instructions import Complex, Instructions, Value, parts
 
 
-def texts(code: Memory, aval: Any, x: np.ndarray, lanes: bool) -> list[str]:
+def texts(code: Instructions, aval: Any, x: np.ndarray, lanes: bool) -> list[str]:
     """The operands of the entries; with `lanes` vectors, also of what is the same in all lanes."""
     numbers = [y for e in x.ravel() for y in (parts(e) if np.dtype(aval.dtype).kind == "c" else (e,))]
     if not lanes and any(isinstance(y, Value) and y.lanes for y in numbers):
-        raise Unsupported("a number of each lane where one for all is expected")
+        raise AssertionError("a number of each lane where one for all is expected")
     return [code.text(y, kind, lanes) for y, kind in zip(numbers, kinds_of(aval), strict=True)]
 
 
@@ -24,12 +24,6 @@ def of_texts(names: list[str], aval: Any, lanes: bool) -> np.ndarray:
     if np.dtype(aval.dtype).kind == "c":
         values = [Complex(*pair) for pair in zip(values[::2], values[1::2], strict=True)]
     return objects(values, aval.shape)
-
-
-def kinds_of(aval: Any) -> list[str]:
-    """The LLVM types of an array's numbers, two for a complex one."""
-    kind, count = parts_of(aval.dtype)
-    return [kind] * (count * aval.size)
 
 
 def has_lanes(x: Any) -> bool:

@@ -9,10 +9,12 @@ from typing import Any
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from ..jaxprs.inline import CALLS
-from .arrays import SMALL
+from ..thresholds import THRESHOLDS
+from .registry import RULES
 
 
-_AT_A_PLACE = frozenset({"dynamic_slice", "dynamic_update_slice", "gather", "scatter", "scatter-add", "maybe_set"})
+# They are updates at places found at run time, before they are inlined.
+_UPDATES = frozenset({"maybe_set"})
 
 
 def varying(jaxpr: ClosedJaxpr | Jaxpr, inputs: Sequence[bool], in_memory: bool = True) -> list[bool]:
@@ -21,11 +23,12 @@ def varying(jaxpr: ClosedJaxpr | Jaxpr, inputs: Sequence[bool], in_memory: bool 
     found: dict[Any, bool] = dict(zip(jaxpr.invars, inputs, strict=True))
     read = lambda v: not isinstance(v, Literal) and found.get(v, False)
     for eqn in jaxpr.eqns:
-        found.update(zip(eqn.outvars, _results(eqn, list(map(read, eqn.invars)), in_memory), strict=True))
+        found.update(zip(eqn.outvars, results(eqn, list(map(read, eqn.invars)), in_memory), strict=True))
     return list(map(read, jaxpr.outvars))
 
 
-def _results(eqn: Any, args: list[bool], in_memory: bool) -> list[bool]:
+def results(eqn: Any, args: list[bool], in_memory: bool = True) -> list[bool]:
+    """For each result of an equation whether it may."""
     name, p, n = eqn.primitive.name, eqn.params, len(eqn.outvars)
     if name in CALLS:
         return varying(p[CALLS[name]], args, in_memory)
@@ -41,8 +44,9 @@ def _results(eqn: Any, args: list[bool], in_memory: bool) -> list[bool]:
     if name == "cond":
         which, *rest = args
         return [which or any(of) for of in zip(*(varying(b, rest, in_memory) for b in p["branches"]), strict=True)]
-    large = in_memory and any(getattr(v.aval, "size", 1) > SMALL for v in (*eqn.invars, *eqn.outvars))
-    return [any(args) or large or (in_memory and name in _AT_A_PLACE)] * n
+    large = in_memory and any(getattr(v.aval, "size", 1) > THRESHOLDS.carried for v in (*eqn.invars, *eqn.outvars))
+    by_memory = in_memory and (name in _UPDATES or (name in RULES and RULES[name].by_memory))
+    return [any(args) or large or by_memory] * n
 
 
 def varying_in_loop(p: Any, args: list[list[bool]], in_memory: bool = True) -> list[bool]:

@@ -1,0 +1,35 @@
+"""Arrays of entries: numpy arrays of objects, each of them a number where that is known."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+
+def objects(entries: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """A list as an array of objects."""
+    out = np.empty(len(entries), dtype=object)
+    for i, entry in enumerate(entries):  # `out[:] = entries` would ask traced entries for their values
+        out[i] = entry
+    return out.reshape(shape)
+
+
+def is_number(x: Any, *which: float) -> bool:
+    """Whether an entry is known while tracing, and one of `which` where these are given."""
+    return isinstance(x, np.generic) and (not which or any(x == value for value in which))
+
+
+def are_known(x: np.ndarray) -> bool:
+    """Whether all entries are."""
+    return all(map(is_number, x.ravel()))
+
+
+def as_indices(x: np.ndarray) -> np.ndarray:
+    """Known entries as integers of 64 bits; what is too large for one is the largest."""
+    return np.array([min(int(i), np.iinfo(np.int64).max) for i in x.ravel()], np.int64).reshape(x.shape)
+
+
+def columns(x: np.ndarray, axes: tuple[int, ...]) -> np.ndarray:
+    """An array with these axes as its first one."""
+    x = np.moveaxis(x, axes, range(len(axes)))
+    return x.reshape((math.prod(x.shape[: len(axes)]), *x.shape[len(axes) :]))

@@ -1,0 +1,70 @@
+"""Loops over the indices of arrays, as instructions."""
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..thresholds import THRESHOLDS
+from .instructions import Instructions, Value
+
+
+@contextlib.contextmanager
+def loop(code: Instructions, count: Any, phis: list[str] | None = None) -> Iterator[Value]:
+    """Runs what is written inside for an index from 0 to `count`; `phis` are other variables of the loop."""
+    head, body, after, index, following = (code.name() for _ in range(5))
+    before = code.block
+    code.longest = max(code.longest, count if isinstance(count, int) else 0)
+    code.jump(head)
+    code.label(head)
+    here = len(code.lines)
+    i = Value(f"%{index}", "i64")
+    code.branch(code.op("icmp slt", "i64", i, count, result="i1"), body, after)
+    code.label(body)
+    with code.scope():
+        yield i
+    code.lines.append(f"%{following} = add i64 %{index}, 1")
+    own = f"%{index} = phi i64 [ 0, %{before} ], [ %{following}, %{code.block} ]"
+    code.lines[here:here] = [own, *(phis or [])]
+    code.jump(head)
+    code.label(after)
+
+
+def for_each(
+    code: Instructions, shape: Sequence[int], action: Callable[[list[Any]], None], few: int = THRESHOLDS.per_turn
+) -> None:
+    """Does something with each index, in loops whose body has the last `few` written out."""
+    outer, size = len(shape), 1
+    while outer and size * shape[outer - 1] <= few:
+        outer, size = outer - 1, size * shape[outer - 1]
+    with contextlib.ExitStack() as stack:
+        index = [0 if n == 1 else stack.enter_context(loop(code, n)) for n in shape[:outer]]
+        for inner in np.ndindex(*shape[outer:]):
+            action([*index, *inner])
+
+
+def accumulated(
+    code: Instructions,
+    shape: Sequence[int],
+    first: Sequence[Any],
+    kinds: Sequence[str],
+    step: Callable[[list[Any], list[Any]], Sequence[Any]],
+) -> list[Any]:
+    """What `step(found, index)` makes of the first numbers, index after index."""
+    lanes = code.width > 1
+
+    def over(index: list[Any], found: list[Any]) -> list[Any]:
+        if len(index) == len(shape):
+            return list(step(found, index))
+        before, phis = code.block, []
+        carried = [Value(f"%{code.name()}", kind, lanes) for kind in kinds]
+        with loop(code, shape[len(index)], phis) as i:
+            for x, y, z in zip(carried, found, over([*index, i], carried), strict=True):
+                start, after = (code.text(n, x.kind, lanes) for n in (y, z))
+                vector = code.type(x.kind, lanes)
+                phis.append(f"{x.name} = phi {vector} [ {start}, %{before} ], [ {after}, %{code.block} ]")
+        return list(carried)
+
+    found = [code.copy(x, kind) if lanes else x for x, kind in zip(first, kinds, strict=True)]
+    return over([], [code.in_lanes(x) for x in found] if lanes else found)

@@ -1,0 +1,89 @@
+"""Whether a function can be compiled, and to what: found before an instruction is written, by the only judge."""
+
+import functools
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+from jax.extend.core import ClosedJaxpr
+
+from ..emit import machine
+from ..jaxprs.scalar_interpreter import Unsupported
+from ..thresholds import THRESHOLDS
+from . import estimate, rules as rules
+from .annotated import Annotated
+from .dtypes import ALL
+from .inlining import Inlining, inner
+from .lowering import TooLarge
+from .module_text import module_text
+from .registry import RULES, named, quoted
+
+
+def annotate(jaxpr: ClosedJaxpr, batched: tuple[bool, ...] = ()) -> Annotated | Unsupported:
+    """The function as it will be compiled, or why it cannot be; `batched`: which arguments have a leading axis of lanes."""
+    if not machine.available():
+        return Unsupported("no machine code is made for this operating system", primitive="system")
+    return _annotated(jaxpr, batched)
+
+
+def unsupported(jaxpr: ClosedJaxpr, batched: tuple[bool, ...] = ()) -> tuple[Unsupported, ...]:
+    """All that keeps a function from being compiled; empty if nothing does."""
+    judged, inlined = annotate(jaxpr, batched), Inlining()
+    if isinstance(judged, Annotated):
+        return ()
+    return tuple(_unsupported(inlined(jaxpr), inlined)) or (judged,)
+
+
+@functools.lru_cache(maxsize=4)
+def _annotated(jaxpr: ClosedJaxpr, batched: tuple[bool, ...]) -> Annotated | Unsupported:
+    inlined = Inlining()
+    found = next(_unsupported(inlined(jaxpr), inlined), None)
+    if found is not None:
+        return found
+    annotated = estimate.annotated(inlined(jaxpr), batched, inlined)
+    return _too_large(annotated) or annotated
+
+
+def _unsupported(jaxpr: ClosedJaxpr, inlined: Inlining) -> Iterator[Unsupported]:
+    for v in (*jaxpr.jaxpr.invars, *jaxpr.jaxpr.outvars):
+        if named(v.aval) not in ALL:
+            yield Unsupported(
+                f"{named(v.aval)} is no type of number that is compiled", primitive="convert_element_type"
+            )
+    yield from _unsupported_within(jaxpr, inlined)
+
+
+def _unsupported_within(jaxpr: ClosedJaxpr, inlined: Inlining) -> Iterator[Unsupported]:
+    if any(isinstance(x, jax.core.Tracer) for x in jaxpr.consts):
+        yield Unsupported("a constant is being traced", primitive="constant")
+    for eqn in jaxpr.jaxpr.eqns:
+        reason = _reason(eqn)
+        if reason:
+            yield Unsupported(reason, quoted(eqn), eqn.primitive.name)
+        elif RULES[eqn.primitive.name].nested:
+            for body in inner(eqn):
+                yield from _unsupported_within(inlined(body), inlined)
+
+
+def _reason(eqn: Any) -> str | None:
+    name = eqn.primitive.name
+    if eqn.effects:
+        return f"`{name}` has side effects"
+    return RULES[name].unsupported(eqn) if name in RULES else f"`{name}` has no rule"
+
+
+def _too_large(annotated: Annotated) -> Unsupported | None:
+    """Why it is too large. Where the estimates do not settle it, it is written to see."""
+    cost, limit = annotated.cost, THRESHOLDS.instructions
+    reason = f"it takes more than {limit} instructions, or {THRESHOLDS.heap_bytes} bytes, which is slow to compile"
+    refused = Unsupported(reason, primitive="size")
+    if cost > THRESHOLDS.overestimate * limit:
+        return refused
+    # With arrays that are copied, and those of loops and branches.
+    if cost <= limit and 3 * annotated.bytes * annotated.width <= THRESHOLDS.heap_bytes:
+        return None
+    try:
+        module_text(annotated, limit=limit)
+    except TooLarge:
+        return refused
+    return None

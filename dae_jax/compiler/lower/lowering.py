@@ -1,0 +1,82 @@
+"""Jaxprs written as instructions, equation by equation, each by the rule of its primitive."""
+
+from typing import Any
+
+import numpy as np
+from jax.extend.core import ClosedJaxpr
+
+from ..jaxprs.numbers import on_numbers
+from ..jaxprs.objects import is_number, objects
+from ..thresholds import THRESHOLDS
+from . import rules as rules
+from .context import Context
+from .environment import Environment
+from .inlining import Inlining
+from .instructions import Instructions
+from .memory import Memory
+from .registry import RULES, Rule, quoted
+
+
+class TooLarge(Exception):
+    """More instructions have been written than may be."""
+
+
+class LoweringError(RuntimeError):
+    """A rule has failed for an equation that it takes by what it declares."""
+
+
+class Lowering:
+    """A function that is being written.
+
+    An entry that is known is a numpy scalar. `limit`: after how many instructions it is given up with `TooLarge`.
+    """
+
+    def __init__(self, width: int, always_copies: bool, limit: float, inlined: Inlining) -> None:
+        self.code = Instructions(width)
+        self.memory = Memory(self.code, always_copies)
+        self._limit, self._inlined = limit, inlined
+
+    def run(self, closed: ClosedJaxpr, args: list[Any]) -> list[Any]:
+        """Writes a jaxpr; gives its results."""
+        environment = Environment(self, self._inlined(closed), args)
+        environment.advance(0, len(environment.jaxpr.eqns))
+        return environment.results()
+
+    def constant(self, x: Any) -> Any:
+        """Known numbers; many of them are data of the module."""
+        x = np.asarray(x)
+        if x.size > THRESHOLDS.folded:
+            return self.memory.constant_view(x)
+        return objects([x[i] for i in np.ndindex(x.shape)], x.shape)
+
+    def equation(self, eqn: Any, args: list[Any]) -> list[Any]:
+        """Writes an equation; gives its results."""
+        rule = RULES[eqn.primitive.name]
+        try:
+            large = rule.nested or self._is_large(rule, eqn, args)
+            args = args if large else list(map(self.memory.entries, args))
+            out = rule.lower(Context(self, eqn, large), *args, **eqn.params)
+        except (TooLarge, LoweringError):
+            raise
+        except Exception as error:
+            raise LoweringError(f"The rule of `{eqn.primitive.name}` failed at {quoted(eqn)}: {error!r}") from error
+        if len(self.code.lines) > self._limit:
+            raise TooLarge
+        return out if isinstance(out, list) else [out]
+
+    def _is_large(self, rule: Rule, eqn: Any, args: list[Any]) -> bool:
+        """Whether an operand is in memory, or the result is so large that it shall be."""
+        largest = max((v.aval.size for v in eqn.outvars), default=0)
+        if largest > THRESHOLDS.folded or (largest > THRESHOLDS.in_registers and not _stays_known(rule, eqn, args)):
+            return True
+        return any(not isinstance(a, np.ndarray) and a.size > self.memory.few for a in args)
+
+
+def _stays_known(rule: Rule, eqn: Any, args: list[Any]) -> bool:
+    """Whether all operands are numbers, and the results are then too, without an instruction."""
+    if not all(isinstance(a, np.ndarray) and all(map(is_number, a.ravel())) for a in args):
+        return False
+    if rule.moves:
+        return True
+    values = [np.array(list(a.ravel()), v.aval.dtype).reshape(a.shape) for a, v in zip(args, eqn.invars, strict=True)]
+    return on_numbers(eqn, values) is not None

@@ -1,0 +1,132 @@
+"""A jaxpr as one function in the machine's code: for one element, or for a batch whose elements are lanes of vectors."""
+
+import contextlib
+from typing import Any
+
+import numpy as np
+
+from ..emit import machine
+from ..thresholds import THRESHOLDS
+from .access import store
+from .annotated import Annotated
+from .arrays import Buffer, View, row_major
+from .dtypes import parts_of
+from .instructions import Value
+from .lane_queue import LaneQueue, NotQueued, main_loop
+from .lowering import Lowering, TooLarge
+
+
+def module_text(annotated: Annotated, always_copies: bool = False, limit: float = np.inf) -> str:
+    """The module whose function `{name}.kernel` computes the outputs from the inputs.
+
+    With batched inputs the function is that of a batch: these inputs, and all outputs, have a leading axis of any length.
+    `always_copies`: nothing is updated in place, and no memory used twice.
+
+    Errors: `TooLarge` for more than `limit` instructions, or arrays that take too much memory; none without a limit.
+    """
+    place = main_loop(annotated.jaxpr) if any(annotated.batched) else None
+    if place is not None:
+        with contextlib.suppress(NotQueued):
+            return _Module(annotated, always_copies, limit).text(place)
+    return _Module(annotated, always_copies, limit).text(None)
+
+
+class _Module:
+    def __init__(self, annotated: Annotated, always_copies: bool, limit: float) -> None:
+        self.jaxpr, self.limit = annotated.jaxpr, limit
+        self.batched = list(annotated.batched) or [False] * len(self.jaxpr.jaxpr.invars)
+        self.lowering = Lowering(annotated.width, always_copies, limit, annotated.inlined)
+        self.code, self.memory = self.lowering.code, self.lowering.memory
+
+    def text(self, place: int | None) -> str:
+        """The module's text; `place`: where the main loop is, if lanes shall be refilled."""
+        code, memory, lanes = self.code, self.memory, any(self.batched)
+        ins, outs = self.jaxpr.jaxpr.invars, self.jaxpr.jaxpr.outvars
+        code.block = "start"
+        if lanes:
+            self._batch(place)
+        else:
+            self._store(self.lowering.run(self.jaxpr, self._arguments(None)), None, None)
+        found = [line for k in range(len(ins)) for line in machine.buffer("%args", k, f"arg{k}")]
+        found += [line for k in range(len(outs)) for line in machine.buffer("%results", k, f"result{k}")]
+        found += self._heap()
+        body = [*found, *memory.stack, "br label %start", "start:", *code.lines]
+        enough = THRESHOLDS.vectors_per_call * code.width
+        functions = (
+            machine.in_threads(body, self.batched.index(True), enough)
+            if lanes
+            else machine.alone(body, code.longest >= THRESHOLDS.long_loop)
+        )
+        return "\n".join([*memory.constants, *code.declared.values(), *functions])
+
+    def _heap(self) -> list[str]:
+        """The instructions that take the memory of all arrays at once."""
+        code, size = self.code, self.memory.heap
+        if size > THRESHOLDS.heap_bytes and self.limit < np.inf:
+            raise TooLarge
+        if not size:
+            return []
+        code.function("malloc", "ptr", "i64")
+        code.function("free", "void", "ptr")
+        code.lines.append("call void @free(ptr %heap.raw)")
+        return [
+            f"%heap.raw = call ptr @malloc(i64 {size + 64})",
+            "%heap.int = ptrtoint ptr %heap.raw to i64",
+            "%heap.up = add i64 %heap.int, 63",
+            "%heap.aligned = and i64 %heap.up, -64",
+            "%heap = inttoptr i64 %heap.aligned to ptr",
+        ]
+
+    def _arguments(self, row: Value | None) -> list[Any]:
+        """The arguments, of the element that each lane has."""
+        args = []
+        for k, (v, batched) in enumerate(zip(self.jaxpr.jaxpr.invars, self.batched, strict=True)):
+            x = self._view(f"%arg{k}", v.aval, row if batched else None, writable=False)
+            args.append(x if x.size > THRESHOLDS.carried else self.memory.entries(x))
+        return args
+
+    def _store(self, results: list[Any], row: Value | None, mask: Value | None) -> None:
+        """Stores the results of the element that each lane has, in the lanes of the mask."""
+        code, memory = self.code, self.memory
+        before, code.mask = code.mask, mask
+        for k, (v, x) in enumerate(zip(self.jaxpr.jaxpr.outvars, results, strict=True)):
+            to = self._view(f"%result{k}", v.aval, row, writable=True)
+            if not isinstance(x, np.ndarray) and x.size > THRESHOLDS.carried:
+                memory.assign(to, x)
+                continue
+            for index in np.ndindex(v.aval.shape):
+                store(code, to.buffer, memory.at(to, index), memory.entry(x, index))
+        code.mask = before
+
+    def _view(self, pointer: str, aval: Any, row: Value | None, writable: bool) -> View:
+        kind, parts = parts_of(aval.dtype)
+        buffer = Buffer(pointer, kind, False, writable, parts)
+        place = 0 if row is None else self.code.times(row, aval.size)
+        return View(np.dtype(aval.dtype), aval.shape, buffer, row_major(aval.shape), place)
+
+    def _batch(self, place: int | None) -> None:
+        """All elements that this thread gets: threads take them from a counter, as they get on."""
+        code, width = self.code, self.code.width
+        size, last = Value("%batch", "i64"), Value("%batch.last", "i64")
+        self.memory.stack += [
+            *machine.batch_size(f"arg{self.batched.index(True)}"),
+            f"{last.name} = sub i64 {size.name}, 1",
+        ]
+        if place is not None:
+            LaneQueue(self.lowering, self._arguments, self._store, size, last).write(self.jaxpr, place)
+            return
+        # A vector of elements at a time; the lanes that the last one has too many repeat the last element.
+        lanes = Value("<" + ", ".join(f"i64 {k}" for k in range(width)) + ">", "i64", True)
+        more, done = code.name(), code.name()
+        code.jump("next")
+        code.label("next")
+        start = code.write(f"atomicrmw add ptr %taken, i64 {width} monotonic", "i64", False)
+        code.branch(code.op("icmp slt", "i64", start, size, result="i1"), more, done)
+        code.label(more)
+        with code.scope():
+            element = code.op("add", "i64", start, lanes)
+            row = code.intrinsic("smin", "i64", element, last)
+            inside = code.op("icmp sle", "i64", element, last, result="i1")
+            self._store(self.lowering.run(self.jaxpr, self._arguments(row)), row, inside)
+        code.jump("next")
+        code.label(done)

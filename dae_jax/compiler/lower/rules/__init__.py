@@ -1,0 +1,14 @@
+"""The rules, by kind of primitive; importing this enters them into the table."""
+
+from . import (
+    branches as branches,
+    contractions as contractions,
+    elementwise as elementwise,
+    floats as floats,
+    indexing as indexing,
+    integers as integers,
+    loops as loops,
+    movement as movement,
+    reductions as reductions,
+    selections as selections,
+)

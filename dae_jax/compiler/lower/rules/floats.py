@@ -1,0 +1,114 @@
+"""Rules of primitives on real floating-point numbers."""
+
+from typing import Any
+
+import numpy as np
+from jax.extend.core import Literal
+
+from ...emit.machine import has_symbol
+from ..arithmetic import convert
+from ..context import Context
+from ..dtypes import BYTES, FLOATS, INTEGERS, kind_of
+from ..entrywise import entrywise
+from ..instructions import Instructions, Value
+
+
+_INTRINSICS = {"sqrt": "sqrt", "floor": "floor", "ceil": "ceil"}
+_ROOTS = {0.5: 1, 0.25: 2, 0.125: 3}
+
+
+def _in_library(eqn: Any) -> str | None:
+    name = f"{eqn.primitive.name}{'f' if eqn.outvars[0].aval.dtype == np.float32 else ''}"
+    return None if has_symbol(name) else f"the C library has no {name}"
+
+
+@entrywise(
+    "sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp exp2 expm1 log log1p cbrt erf erfc atan2",
+    FLOATS, requires=_in_library,
+)  # fmt: skip
+def library(context: Context, *x: Any, **_: Any) -> Value:
+    """A function of the C library's."""
+    return context.code.library(context.name, kind_of(context.dtype), *x)
+
+
+@entrywise("sqrt floor ceil", FLOATS)
+def intrinsic(context: Context, x: Any, **_: Any) -> Value:
+    """An instruction of the machine's."""
+    return context.code.intrinsic(_INTRINSICS[context.name], kind_of(context.dtype), x)
+
+
+@entrywise("rsqrt", FLOATS)
+def rsqrt(context: Context, x: Any, **_: Any) -> Value:
+    """1/√x."""
+    kind = kind_of(context.dtype)
+    return context.code.op("fdiv", kind, 1.0, context.code.intrinsic("sqrt", kind, x))
+
+
+@entrywise("pow", (FLOATS, FLOATS | INTEGERS), requires=_in_library)
+def pow_(context: Context, x: Any, y: Any, **_: Any) -> Any:
+    """x to the power of a real or a whole number."""
+    code, kind = context.code, kind_of(context.to)
+    y = convert(code, y, context.dtype, context.to)
+    if not isinstance(y, Value) and y in _ROOTS:
+        return _root(code, x, _ROOTS[y], kind)
+    return code.library("pow", kind, x, y)
+
+
+def _root(code: Instructions, x: Any, times: int, kind: str) -> Value:
+    """The square root of the square root …; of −0 and −∞ as a power has it."""
+    x = code.select(code.op("fcmp oeq", kind, x, -np.inf, result="i1"), np.inf, x, kind)
+    x = code.op("fadd", kind, x, 0.0)
+    for _ in range(times):
+        x = code.intrinsic("sqrt", kind, x)
+    return x
+
+
+@entrywise("logistic", FLOATS)
+def logistic(context: Context, x: Any, **_: Any) -> Value:
+    """1/(1 + e⁻ˣ)."""
+    code, kind = context.code, kind_of(context.dtype)
+    grown = code.library("exp", kind, code.op("fneg", kind, x))
+    return code.op("fdiv", kind, 1.0, code.op("fadd", kind, 1.0, grown))
+
+
+@entrywise("round", FLOATS)
+def rounded(context: Context, x: Any, *, rounding_method: Any, **_: Any) -> Value:
+    """The nearest whole number; halves away from zero, or to even ones."""
+    name = "round" if int(rounding_method) == 0 else "roundeven"
+    return context.code.intrinsic(name, kind_of(context.dtype), x)
+
+
+@entrywise("is_finite", FLOATS)
+def is_finite(context: Context, x: Any, **_: Any) -> Value:
+    """Whether it is neither infinite nor NaN."""
+    kind = kind_of(context.dtype)
+    return context.code.op("fcmp olt", kind, context.code.intrinsic("fabs", kind, x), np.inf, result="i1")
+
+
+@entrywise("nextafter", FLOATS)
+def nextafter(context: Context, x: Any, y: Any, **_: Any) -> Any:
+    """The next number from x towards y."""
+    code, kind = context.code, kind_of(context.dtype)
+    integer = f"i{8 * BYTES[kind]}"
+    x, y = (code.copy(z, kind) for z in (x, y))
+    bits = code.cast("bitcast", x, integer)
+    away = code.op("xor", "i1", *(code.op("fcmp olt", kind, a, b, result="i1") for a, b in ((x, y), (0.0, x))))
+    step = code.select(away, -1, 1, integer)
+    moved = code.cast("bitcast", code.op("add", integer, bits, step), kind)
+    least = code.cast("bitcast", Value("1", integer), kind)
+    moved = code.select(
+        code.op("fcmp oeq", kind, x, 0.0, result="i1"), code.intrinsic("copysign", kind, least, y), moved, kind
+    )
+    same = code.op("fcmp oeq", kind, x, y, result="i1")
+    undefined = code.op("fcmp uno", kind, x, y, result="i1")
+    return code.select(undefined, code.op("fadd", kind, x, y), code.select(same, y, moved, kind), kind)
+
+
+def _of_literal(eqn: Any) -> str | None:
+    return None if isinstance(eqn.invars[0], Literal) else "`lgamma` is written for known numbers only"
+
+
+@entrywise("lgamma", FLOATS, requires=_of_literal)
+def lgamma(*_: Any, **__: Any) -> Any:
+    """Of known numbers only, as the factorials of Taylor arithmetic are: nothing is written for these."""
+    raise AssertionError

@@ -1,0 +1,33 @@
+"""Rules of primitives on integers and truth values."""
+
+from typing import Any
+
+from ..context import Context
+from ..dtypes import BOOL, BYTES, INTEGERS, kind_of
+from ..entrywise import entrywise
+from ..instructions import Value
+
+
+_SHIFTS = {"shift_left": "shl", "shift_right_logical": "lshr"}
+
+
+@entrywise("not", INTEGERS | BOOL)
+def inverted(context: Context, x: Any, **_: Any) -> Value:
+    """All bits the other way."""
+    return context.code.op("xor", kind_of(context.dtype), x, -1)
+
+
+@entrywise("shift_left shift_right_logical", INTEGERS)
+def shift(context: Context, x: Any, by: Any, **_: Any) -> Any:
+    """By the width and more, and by less than none, all bits are shifted out; a shift of LLVM's is undefined there."""
+    code, kind = context.code, kind_of(context.dtype)
+    last = 8 * BYTES[kind] - 1
+    shifted = code.op(_SHIFTS[context.name], kind, x, code.op("and", kind, by, last))
+    return code.select(code.op("icmp ule", kind, by, last, result="i1"), shifted, 0, kind)
+
+
+@entrywise("shift_right_arithmetic", INTEGERS)
+def shift_right_arithmetic(context: Context, x: Any, by: Any, **_: Any) -> Value:
+    """The sign is shifted in, by the width and more everywhere."""
+    code, kind = context.code, kind_of(context.dtype)
+    return code.op("ashr", kind, x, code.intrinsic("umin", kind, by, 8 * BYTES[kind] - 1))

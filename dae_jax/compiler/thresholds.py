@@ -1,0 +1,52 @@
+"""Where the compiler changes its mind: each threshold with what was measured for it."""
+
+import dataclasses
+
+
+@dataclasses.dataclass(frozen=True)
+class Thresholds:
+    """Numbers that say how code is written, none of which changes what it computes.
+
+    Arrays:
+    - `carried`: entries up to which an array is kept in registers where a loop carries it, where it is an argument, and where
+      lanes hold it. More phi nodes than these are spilled.
+    - `few`: entries up to which an array in memory is read into registers by an operation on one element.
+    - `in_registers`: entries up to which an operation on registers writes out its result entry by entry; what is larger is a loop.
+    - `folded`: entries up to which what a constant gives is worked out while compiling; larger ones are data of the module.
+    - `per_turn`: entries that the body of a loop over an array has written out at most. More gain nothing, and take longer to compile.
+    - `stack_bytes`: bytes of a buffer that the stack holds; larger ones are taken from the heap, all at once.
+    - `heap_bytes`: bytes of memory that a function may take for its arrays, all lanes of a vector together.
+    - `fused_depth`: operations in one loop; more would nest our own calls too deep.
+    - `long_loop`: turns from which on loops use the machine's longest vectors: a chain of 64 pendulums gains 15 %, arrays of ten
+      lose 25 %.
+
+    Control flow:
+    - `written_out`: equations up to which a loop of a known number of turns is written out.
+    - `compaction`: what an exchange of lanes costs, in turns of the loop of all lanes.
+    - `vectors_per_call`: vectors of a batch below which a thread is not worth the 20 µs that it takes to start.
+
+    Size:
+    - `instructions`: more take longer to compile than they save.
+    - `overestimate`: the estimate counts up to this many instructions for each that is written, since it knows of no zeros and of
+      nothing that is there twice. In between the function is written to see.
+    - `loop_cost`: a loop over an array takes about as many instructions as this many entries do.
+    """
+
+    carried: int = 24
+    few: int = 8
+    in_registers: int = 512
+    folded: int = 4096
+    per_turn: int = 4
+    stack_bytes: int = 1024
+    heap_bytes: int = 2**30
+    fused_depth: int = 40
+    long_loop: int = 256
+    written_out: int = 200
+    compaction: int = 2
+    vectors_per_call: int = 4
+    instructions: int = 60_000
+    overestimate: int = 4
+    loop_cost: int = 12
+
+
+THRESHOLDS = Thresholds()
