@@ -97,12 +97,12 @@ def parted(name: str, dtype: str, draw: Draw) -> Operation:
 
 
 @recipe("reduce_sum", _NUMBERS)
-@recipe("reduce_prod", (*FLOATS, *INTEGERS))
+@recipe("reduce_prod", _NUMBERS)
 @recipe("reduce_max reduce_min", REAL)
 @recipe("reduce_and reduce_or reduce_xor", (*INTEGERS, *BOOL))
 def reduction(name: str, dtype: str, draw: Draw) -> Operation:
     domain = {"reduce_sum": "grid", "reduce_prod": "units"}.get(name, "edges")
-    x = Operand(dtype, draw.shape(1), "plain" if dtype in COMPLEX else domain)
+    x = Operand(dtype, draw.shape(1), "plain" if dtype in COMPLEX and name == "reduce_sum" else domain)
     axes = draw.axes(len(x.shape))
     how = getattr(lax, f"{name}_p", None)
     fn = lambda a: how.bind(a, axes=axes, out_sharding=None) if name in ("reduce_sum", "reduce_max", "reduce_min") else how.bind(a, axes=axes)
@@ -118,12 +118,12 @@ def place(name: str, dtype: str, draw: Draw) -> Operation:
 
 
 @recipe("cumsum", _NUMBERS)
-@recipe("cumprod", (*FLOATS, *INTEGERS))
+@recipe("cumprod", _NUMBERS)
 @recipe("cummax cummin", (*FLOATS, *INTEGERS))
 def accumulated(name: str, dtype: str, draw: Draw) -> Operation:
     domain = {"cumsum": "grid", "cumprod": "units"}.get(name, "edges")
-    shape = draw.shape(1, draw.one_of([1, 3, 8, 24]))
-    x = Operand(dtype, shape, "plain" if dtype in COMPLEX else domain)
+    shape = draw.shape(1, draw.one_of([1, 3, 8, 24, 25, 60]))
+    x = Operand(dtype, shape, "plain" if dtype in COMPLEX and name == "cumsum" else domain)
     axis, reverse = draw.below(len(x.shape)), draw.chance(0.5)
     fn = lambda a: getattr(lax, name)(a, axis=axis, reverse=reverse)
     return Operation(name, fn, (x,), smooth=dtype in FLOATS and name == "cumsum")

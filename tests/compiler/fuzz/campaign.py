@@ -22,6 +22,20 @@ def of_seed(seed: int) -> Iterator[Program]:
     yield from (composed(COMPOSED * seed + k, copies=k % 3 == 0) for k in range(COMPOSED))
 
 
+def fixed() -> Iterator[Program]:
+    """Those that are always the same: 460 with one primitive, evenly over the table, and 40 compositions."""
+    order = Draw(0).order(len(CLAIMED))
+    yield from (single(*CLAIMED[k], 0) for k in order[:460])
+    yield from (composed(k, copies=k % 3 == 0) for k in range(40))
+
+
+def new(seed: int) -> Iterator[Program]:
+    """85 with one primitive and 15 compositions."""
+    draw = Draw(seed)
+    yield from (single(*draw.one_of(CLAIMED), seed) for _ in range(85))
+    yield from (composed(seed + k, copies=k % 3 == 0) for k in range(15))
+
+
 def bundles(programs: Iterable[Program]) -> Iterator[list[Program]]:
     """Such as take copies by themselves, of compositions a few."""
     waiting: dict[tuple[bool, bool], list[Program]] = {}

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from dae_jax.compiler.emit import machine
-from dae_jax.compiler.lower import compiled
+from dae_jax.compiler.lower import compiled, unsupported
 
 from .compare import difference
 from .numbers import Draw
@@ -56,6 +56,14 @@ def _options() -> dict[str, Any]:
     return _QUICK
 
 
+@functools.cache
+def refused(program: Program) -> str | None:
+    """Why the compiler does not take it, by what it says of it."""
+    first = [x if s else x[0] for x, s in zip(arguments(program), program.shared, strict=True)]
+    found = unsupported(jax.make_jaxpr(program.fn)(*first))
+    return str(found[0]) if found else None
+
+
 def by_xla(fn: Any, args: Sequence[Any], shared: Sequence[bool]) -> list[Any]:
     """Element after element."""
     batched = [x for x, s in zip(args, shared, strict=True) if not s]
@@ -73,6 +81,9 @@ def by_xla(fn: Any, args: Sequence[Any], shared: Sequence[bool]) -> list[Any]:
 
 def differences(programs: Sequence[Program]) -> list[Difference]:
     """What the programs, compiled together, give otherwise than by XLA."""
+    programs = [p for p in programs if not refused(p)]
+    if not programs:
+        return []
     args = [arguments(p) for p in programs]
     ends = np.cumsum([len(a) for a in args]).tolist()
 

@@ -5,9 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dae_jax.compiler.lower.arrays import SMALL
-from dae_jax.compiler.lower.in_memory import LARGE
-from dae_jax.compiler.lower.primitives import KNOWN
+from dae_jax.compiler.thresholds import THRESHOLDS
 
 
 FLOATS = ("float64", "float32")
@@ -20,7 +18,8 @@ REAL = FLOATS + INTEGERS + BOOL
 ALL = REAL + COMPLEX
 
 # On both sides of what is kept as values, written out and kept known.
-SIZES = {0: 1, 1: 4, 3: 8, 8: 2, SMALL: 1.5, SMALL + 1: 4, LARGE + 1: 0.7, KNOWN + 1: 0.15}
+SMALL, LARGE, KNOWN = THRESHOLDS.carried, THRESHOLDS.in_registers, THRESHOLDS.folded
+SIZES = {0: 1, 1: 4, 3: 9, 4: 1, SMALL: 0.7, SMALL + 1: 2, LARGE + 1: 0.4, KNOWN + 1: 0.1}
 
 
 class Operand(NamedTuple):
@@ -76,6 +75,8 @@ class Draw:
         shape, dtype = (*batch, *operand.shape), np.dtype(operand.dtype)
         if dtype.kind == "c":
             part = operand._replace(dtype=f"float{4 * dtype.itemsize}")
+            if operand.domain == "units":
+                return self.rng.choice(np.array([1, -1, 1j, -1j], dtype), shape)
             return (self.numbers(part, batch) + 0j + 1j * np.nan_to_num(self.numbers(part, batch), posinf=7)).astype(dtype)
         if dtype.kind == "b":
             return self.rng.integers(0, 2, shape).astype(bool)

@@ -84,9 +84,9 @@ def exactly(name: str, dtype: str, draw: Draw) -> Operation:
     return Operation(name, fn, (Operand(dtype, draw.shape()),), 0, smooth)
 
 
-@recipe("abs", COMPLEX)
-def modulus(name: str, dtype: str, draw: Draw) -> Operation:
-    return Operation(name, lax.abs, (Operand(dtype, draw.shape(), "plain"),), 4, True)
+@recipe("abs square", COMPLEX)
+def of_complex(name: str, dtype: str, draw: Draw) -> Operation:
+    return Operation(name, getattr(lax, name), (Operand(dtype, draw.shape(), "plain"),), 4, name == "abs")
 
 
 @recipe("copy stop_gradient", ALL)
@@ -114,10 +114,10 @@ def whole_power(name: str, dtype: str, draw: Draw) -> Operation:
 @recipe("div", (*FLOATS, *INTEGERS, *COMPLEX))
 @recipe("rem", (*FLOATS, *INTEGERS))
 @recipe("max min", REAL)
-@recipe("add_any", (*FLOATS, *COMPLEX))
+@recipe("add_any", ALL)
 def of_pair(name: str, dtype: str, draw: Draw) -> Operation:
     of_complex = dtype in COMPLEX and name in ("mul", "div")
-    x = Operand(dtype, draw.shape(), "plain" if of_complex else "edges")
+    x = Operand(dtype, draw.shape(), "smooth" if name == "div" and dtype in COMPLEX else "plain" if of_complex else "edges")
     fn = (lambda a, b: jax._src.ad_util.add_any_p.bind(a, b)) if name == "add_any" else getattr(lax, name)
     smooth = dtype in FLOATS and name in ("add", "sub", "mul", "div", "rem")
     return _with_number(Operation(name, fn, (x, x), 16 if of_complex else 0, smooth), draw)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from dae_jax.compiler.lower.control import KNOWN
+from dae_jax.compiler.lower.registry import RULES
 
 from . import arrays as arrays
 from .numbers import Draw, Operand
@@ -19,7 +19,7 @@ from .operations import RECIPES, Operation
 
 
 # What the compiler claims.
-CLAIMED = sorted(key for key in RECIPES if key[0] in KNOWN)
+CLAIMED = sorted((name, dtype) for name, dtype in RECIPES if name in RULES and dtype in frozenset().union(*RULES[name].dtypes))
 
 
 @dataclasses.dataclass(frozen=True)
