@@ -1,6 +1,7 @@
 """How small functions become fast machine code: scalar arithmetic and single kernels."""
 
 from . import waiting as waiting
+from .fallbacks import left_to_xla as left_to_xla
 from .jaxprs.gathers import gathered as gathered, windows as windows
 from .jaxprs.numbers import on_numbers as on_numbers
 from .jaxprs.polynomials import Polynomial as Polynomial, polynomials as polynomials
@@ -10,9 +11,8 @@ from .jaxprs.walk import equations as equations, is_large as is_large
 from .kernel_call import hindrances as hindrances
 from .one_kernel import (
     PullBack as PullBack,
-    configure as configure,
     inexact as inexact,
     one_kernel as one_kernel,
-    one_kernel_enabled as one_kernel_enabled,
 )
+from .settings import configure as configure, one_kernel_enabled as one_kernel_enabled
 from .subroutine import subroutine as subroutine

@@ -13,11 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import batching, mlir
-from jax.interpreters.partial_eval import dce_jaxpr
 
-from . import lower, waiting, xla_kernel
+from . import fallbacks, lower, waiting, xla_kernel
+from ._compat import dce_jaxpr
+from .check import checked
 from .jaxprs.scalar_interpreter import Unsupported
 from .jaxprs.unchecked import without_checks
+from .settings import current
 
 
 kernel_p = Primitive("one_kernel")
@@ -26,8 +28,9 @@ kernel_p.multiple_results = True
 
 def hindrances(jaxpr: ClosedJaxpr) -> tuple[str, ...]:
     """The names of the primitives in `jaxpr`, at any depth, that keep it from being one kernel; empty if none does."""
-    found = lower.hindrances(jaxpr)
-    return found if found == () else xla_kernel.hindrances(jaxpr)
+    if current().compiler == "llvm" and not lower.hindrances(jaxpr):
+        return ()
+    return xla_kernel.hindrances(jaxpr)
 
 
 def as_kernel(fn: Callable[..., Any]) -> Callable[..., Any]:
@@ -94,14 +97,25 @@ def _lower(*args: Any, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> list[Any]
 
 
 def _lowered(args: Any, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> list[Any]:
-    if not lower.hindrances(jaxpr):
-        try:
-            return lower.compiled(jaxpr, lanes)(*args)
-        except Unsupported:
-            pass
-        except Exception as error:  # XLA can still do it
-            warnings.warn(f"A kernel is left to XLA, please report it: {error!r}", RuntimeWarning, stacklevel=2)
-    return _by_xla(jaxpr, lanes, args)
+    ours = _by_llvm(jaxpr, lanes, args)
+    if ours is None:
+        return _by_xla(jaxpr, lanes, args)
+    if current().check:
+        return checked(ours, jax.jit(lambda *xs: _plain(*xs, jaxpr=jaxpr, lanes=lanes))(*args), current().check)
+    return ours
+
+
+def _by_llvm(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Any) -> list[Any] | None:
+    if current().compiler != "llvm" or lower.hindrances(jaxpr):
+        return None
+    try:
+        return lower.compiled(jaxpr, lanes)(*args)
+    except Unsupported as reason:
+        fallbacks.note(str(reason))
+    except Exception as error:  # XLA can still do it
+        fallbacks.note(repr(error))
+        warnings.warn(f"A kernel is left to XLA, please report it: {error!r}", RuntimeWarning, stacklevel=2)
+    return None
 
 
 def _by_xla(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Any) -> list[Any]:

@@ -4,56 +4,17 @@ XLA:CPU runs a loop body as a sequence of kernels and pays for each launch; for 
 4 to 12 times the arithmetic.
 """
 
-import contextlib
-import contextvars
-import os
 from collections.abc import Callable
 from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax._src import xla_bridge
 from jax.flatten_util import ravel_pytree
 
 from .kernel_call import as_kernel
 from .linear_map import Arrays, LinearMap, forward_map, is_inexact, moved
-
-
-_enabled: contextvars.ContextVar[bool] = contextvars.ContextVar("one_kernel", default=True)
-
-
-def configure(*, one_kernel: bool | None = None, process_wide: bool = False) -> contextlib.ExitStack:
-    """Settings of the compilation.
-
-    - `one_kernel`: switches one-kernel compilation on or off, at once; used in a `with` statement, until its end.
-    - `process_wide`: for programs that solve many small problems. Every small loop of the process is compiled to one
-      kernel, also those of other libraries, and a computation runs in the thread that calls it, which saves the 10 to
-      50 µs of handing it to another. Call it before JAX computes anything.
-
-    Errors: `RuntimeError` where JAX has computed something before a process-wide setting.
-    """
-    restore = contextlib.ExitStack()
-    if one_kernel is not None:
-        restore.callback(_enabled.reset, _enabled.set(one_kernel))
-    if process_wide:
-        _configure_process()
-    return restore
-
-
-def _configure_process() -> None:
-    if xla_bridge.backends_are_initialized():
-        raise RuntimeError(
-            "`configure(process_wide=True)` comes too late: JAX has started already. Call it right after the imports."
-        )
-    options = "xla_cpu_small_while_loop_byte_threshold=65536,xla_cpu_use_multi_output_fusion"
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_extra_options={options}"
-    jax.config.update("jax_cpu_enable_async_dispatch", False)
-
-
-def one_kernel_enabled() -> bool:
-    """Whether solves that are traced now may become one kernel."""
-    return _enabled.get()
+from .settings import one_kernel_enabled
 
 
 PullBack = Callable[[Any, Any], list[Any]]
@@ -75,7 +36,7 @@ def one_kernel(
       a way is known that has forward derivatives.
     - `forward`, with "reverse": the same function, with forward derivatives of any order, where `fn` has none.
     """
-    if not _enabled.get() or jax.default_backend() != "cpu" or derivative == "any":
+    if not one_kernel_enabled() or jax.default_backend() != "cpu" or derivative == "any":
         return fn
     return _forward(fn) if derivative == "forward" else _reverse(fn, pull_back, forward or fn)
 

@@ -23,7 +23,6 @@ class Thresholds:
     Control flow:
     - `written_out`: equations up to which a loop of a known number of turns is written out.
     - `compaction`: what an exchange of lanes costs, in turns of the loop of all lanes.
-    - `vectors_per_call`: vectors of a batch below which a thread is not worth the 20 µs that it takes to start.
 
     Size:
     - `instructions`: more take longer to compile than they save.
@@ -43,7 +42,6 @@ class Thresholds:
     long_loop: int = 256
     written_out: int = 200
     compaction: int = 2
-    vectors_per_call: int = 4
     instructions: int = 60_000
     overestimate: int = 4
     loop_cost: int = 12

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dae_jax.compiler.emit import machine
+from dae_jax.compiler.emit.target import vector_size
 from dae_jax.compiler.lower import compiled
 
 
@@ -85,7 +85,7 @@ def test_random_programs(seed):
 # Numbers of every type, in the order of their edges, and what may be done to them. XLA's compiler is asked once, for the
 # largest batch: the elements of a smaller one are the same.
 INTEGERS = [f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)]
-BATCHES = (1, machine.vector_size(), machine.vector_size() + 1, 2 * machine.vector_size() + 3)
+BATCHES = (1, vector_size(), vector_size() + 1, 2 * vector_size() + 3)
 
 
 def edges(dtype, rng, shape):

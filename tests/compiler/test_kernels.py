@@ -11,8 +11,9 @@ import pytest
 
 import dae_jax
 from dae_jax.compiler import configure, hindrances, one_kernel, polynomials, scalarise, subroutine
-from dae_jax.compiler.emit import machine
+from dae_jax.compiler.emit import programs
 from dae_jax.compiler.jaxprs.scalar_interpreter import Unsupported
+from dae_jax.compiler.lower import module
 
 
 def length(x):
@@ -258,7 +259,7 @@ class TestHindrances:
     def test_several_scatter_windows_hinder_xla(self, monkeypatch):
         several = jax.make_jaxpr(lambda x: x.at[jnp.array([0, 2])].set(0))(X)
         assert hindrances(several) == ()
-        monkeypatch.setattr(machine, "available", lambda: False)
+        monkeypatch.setattr(module, "available", lambda: False)
         assert hindrances(several) == ("scatter",)
 
 
@@ -274,7 +275,7 @@ def is_native(fn, *args):
 def is_one_kernel(request, monkeypatch):
     """Whether a function is one kernel, with our own compiler or without."""
     if request.param == "xla":
-        monkeypatch.setattr(machine, "available", lambda: False)
+        monkeypatch.setattr(module, "available", lambda: False)
         return is_marked
     return is_native
 
@@ -350,7 +351,7 @@ def test_what_our_compiler_gives_up_is_left_to_xla(monkeypatch):
     def gives_up(*_):
         raise Unsupported("LLVM: broken")
 
-    monkeypatch.setattr(machine, "_compiled", gives_up)
+    monkeypatch.setattr(programs, "compiled", gives_up)
     fused = one_kernel(lambda x: loop(x) + 0.125, "forward")
     assert is_marked(fused, X)
     close(jax.jit(fused)(X), loop(X) + 0.125)

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from dae_jax.compiler import kernel_call, one_kernel
-from dae_jax.compiler.emit import machine
-from dae_jax.compiler.emit.machine import vector_size
+from dae_jax.compiler.emit.target import vector_size
 from dae_jax.compiler.jaxprs.inline import inlined
 from dae_jax.compiler.jaxprs.scalar_interpreter import Unsupported
 from dae_jax.compiler.lower import annotate, compiled, hindrances, unsupported, written
@@ -383,35 +382,3 @@ def test_what_our_compiler_stumbles_over_is_done_by_xla(monkeypatch):
     monkeypatch.setattr(kernel_call.lower, "compiled", fails)
     with pytest.warns(RuntimeWarning, match="unforeseen"):
         np.testing.assert_allclose(jax.jit(one_kernel(lambda x: x * 2, "forward"))(X), 2 * X)
-
-
-def test_machine_code_is_kept_with_jax_s_own(tmp_path, monkeypatch):
-    text = written(jax.make_jaxpr(jnp.sin)(X)).replace("{name}", "kept")
-    before = jax.config.values["jax_compilation_cache_dir"]
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-    try:
-        code = machine._object_code(text)
-        monkeypatch.delattr(machine, "host")
-        assert machine._object_code(text) == code
-        with pytest.raises(NameError):
-            machine._object_code(text + "\n")
-    finally:
-        jax.config.update("jax_compilation_cache_dir", before)
-
-
-def test_a_broken_module_raises():
-    """LLVM's passes would end the process: a branch on a number that is defined in no block before it."""
-    broken = "define i64 @f(i1 %c) {\nentry:\nbr i1 %c, label %a, label %b\na:\n%x = add i64 1, 2\nbr label %b\nb:\nret i64 %x\n}"
-    with pytest.raises(Unsupported, match="LLVM"):
-        machine._object_code(broken)
-
-
-def test_code_made_by_other_passes_is_not_taken_from_the_cache(tmp_path, monkeypatch):
-    before = jax.config.values["jax_compilation_cache_dir"]
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-    try:
-        first = machine._cached("text")
-        monkeypatch.setattr(machine, "_SPEED", 3)
-        assert machine._cached("text") != first
-    finally:
-        jax.config.update("jax_compilation_cache_dir", before)

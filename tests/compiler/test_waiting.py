@@ -13,7 +13,7 @@ import pytest
 import dae_jax
 from dae_jax import scenes
 from dae_jax.compiler import equations, waiting, without_checks, xla_kernel
-from dae_jax.compiler.emit import machine
+from dae_jax.compiler.emit import object_code
 from dae_jax.compiler.lower import annotate, compiled, hindrances
 from dae_jax.compiler.thresholds import THRESHOLDS
 from dae_jax.solve import prepared
@@ -51,8 +51,8 @@ class TestCost:
 
 class TestCheaperForms:
     def test_a_large_module_is_compiled_without_passes(self, monkeypatch):
-        monkeypatch.setattr(machine, "HEAVY", 0)
-        monkeypatch.setattr(machine, "_optimise", lambda _: (_ for _ in ()).throw(AssertionError("passes were run")))
+        monkeypatch.setattr(object_code, "HEAVY", 0)
+        monkeypatch.setattr(object_code, "_optimise", lambda _: (_ for _ in ()).throw(AssertionError("passes were run")))
         found = compiled(jax.make_jaxpr(lambda x: jnp.sum(jnp.sin(x) * jnp.cos(x)) + 0.731)(X))(X)
         np.testing.assert_allclose(found[0], np.sum(np.sin(X) * np.cos(X)) + 0.731, rtol=1e-14)
 

@@ -6,6 +6,7 @@ from typing import Any
 import jax
 from jax.extend.core import ClosedJaxpr, Jaxpr
 
+from .._compat import is_check
 from .walk import equations_in
 
 
@@ -34,7 +35,7 @@ def _evaluate(jaxpr: Jaxpr, consts: Any, args: Any) -> list[Any]:
 def _results(eqn: Any, values: list[Any]) -> list[Any]:
     """What an equation gives, without the checks in it."""
     name = eqn.primitive.name
-    if name in ("jit", "pjit", "custom_jvp_call", "cond") and any(map(_is_check, equations_in(eqn))):
+    if name in ("jit", "pjit", "custom_jvp_call", "cond") and any(map(is_check, equations_in(eqn))):
         inner = _unchecked(eqn)
         if inner is not None:
             return _evaluate(inner.jaxpr, inner.consts, values[len(values) - len(inner.jaxpr.invars) :])
@@ -51,7 +52,7 @@ def _unchecked(eqn: Any) -> ClosedJaxpr | None:
     name = eqn.primitive.name
     if name == "cond":
         branches = eqn.params["branches"]
-        checked = [any(map(_is_check, b.jaxpr.eqns)) for b in branches]
+        checked = [any(map(is_check, b.jaxpr.eqns)) for b in branches]
         return branches[checked.index(False)] if any(checked) and not all(checked) else None
     if name in ("jit", "pjit"):
         return eqn.params["jaxpr"]
@@ -62,10 +63,3 @@ def _unchecked(eqn: Any) -> ClosedJaxpr | None:
 
 def _is_checking(eqn: Any) -> bool:
     return eqn.primitive.name == "cond" and _unchecked(eqn) is not None
-
-
-def _is_check(eqn: Any) -> bool:
-    if eqn.primitive.name != "pure_callback":
-        return False
-    callback = getattr(eqn.params["callback"], "callback_func", None)
-    return getattr(callback, "__module__", None) == "equinox._errors"

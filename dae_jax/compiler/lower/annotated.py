@@ -4,7 +4,7 @@ import dataclasses
 
 from jax.extend.core import ClosedJaxpr
 
-from ..emit import machine
+from ..emit.target import vector_size
 from .inlining import Inlining
 
 
@@ -48,7 +48,7 @@ class Annotated:
     @property
     def width(self) -> int:
         """How many lanes a vector has."""
-        return machine.vector_size() if any(self.batched) else 1
+        return vector_size() if any(self.batched) else 1
 
     def __str__(self) -> str:
         head = f"{self.cost} instructions, {self.bytes} bytes, {self.width} lanes"

@@ -7,7 +7,7 @@ from typing import Any
 
 from jax.extend.core import ClosedJaxpr, Literal, Var
 
-from ..emit import machine
+from ..emit.target import vector_size
 from ..jaxprs.walk import equations
 from ..thresholds import THRESHOLDS
 from .annotated import Annotated, Note
@@ -32,7 +32,7 @@ class _State:
 def annotated(jaxpr: ClosedJaxpr, batched: tuple[bool, ...], inlined: Inlining) -> Annotated:
     """A function without calls, with what will become of each equation."""
     lanes = list(batched) or [False] * len(jaxpr.jaxpr.invars)
-    found = _Estimate(inlined, machine.vector_size() if any(batched) else 1)
+    found = _Estimate(inlined, vector_size() if any(batched) else 1)
     found.run(jaxpr, [found.loaded(v.aval, each) for v, each in zip(jaxpr.jaxpr.invars, lanes, strict=True)], 0, 1)
     return Annotated(jaxpr, batched, inlined, tuple(found.notes), found.bytes)
 

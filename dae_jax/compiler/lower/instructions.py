@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from ..emit.machine import vector_function, vector_size
+from ..emit.target import vector_size
+from ..emit.vector_math import vector_function
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)

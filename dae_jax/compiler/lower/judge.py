@@ -7,7 +7,7 @@ from typing import Any
 import jax
 from jax.extend.core import ClosedJaxpr
 
-from ..emit import machine
+from ..emit import available
 from ..jaxprs.scalar_interpreter import Unsupported
 from ..thresholds import THRESHOLDS
 from . import estimate, rules as rules
@@ -21,7 +21,7 @@ from .registry import RULES, named, quoted
 
 def annotate(jaxpr: ClosedJaxpr, batched: tuple[bool, ...] = ()) -> Annotated | Unsupported:
     """The function as it will be compiled, or why it cannot be; `batched`: which arguments have a leading axis of lanes."""
-    if not machine.available():
+    if not available():
         return Unsupported("no machine code is made for this operating system", primitive="system")
     return _annotated(jaxpr, batched)
 

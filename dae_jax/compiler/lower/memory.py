@@ -18,7 +18,7 @@ from .instructions import Instructions
 
 
 class Memory:
-    """A function's arrays; `heap` is how many bytes of them are not on the stack."""
+    """A function's arrays; `heap` is how many bytes of them are not on the stack; `stack` and `on_heap` find them."""
 
     def __init__(self, code: Instructions, always_copies: bool = False) -> None:
         self.code = code
@@ -26,6 +26,7 @@ class Memory:
         # What is in memory stays there, unless it has fewer entries; with lanes each of them is a vector.
         self.few = THRESHOLDS.few if code.width == 1 else THRESHOLDS.carried
         self.stack: list[str] = []
+        self.on_heap: list[str] = []
         self.heap = 0
         self.free: dict[int, list[str]] = {}
         self.recycles = not always_copies
@@ -48,7 +49,7 @@ class Memory:
         if size <= THRESHOLDS.stack_bytes:
             self.stack.append(f"{pointer} = alloca [{size} x i8], align 64")
         else:
-            self.stack.append(f"{pointer} = getelementptr i8, ptr %heap, i64 {self.heap}")
+            self.on_heap.append(f"{pointer} = getelementptr i8, ptr %heap, i64 {self.heap}")
             self.heap += -(-size // 64) * 64 + 192
         return Buffer(pointer, kind, self.code.width > 1, parts=parts, plane=plane, bytes=size)
 

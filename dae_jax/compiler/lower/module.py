@@ -7,7 +7,7 @@ from typing import Any
 import jax
 from jax.extend.core import ClosedJaxpr
 
-from ..emit import machine
+from ..emit import register
 from ..jaxprs.scalar_interpreter import Unsupported
 from .judge import annotate, unsupported
 from .module_text import module_text
@@ -29,7 +29,7 @@ def written(jaxpr: ClosedJaxpr, batched: tuple[bool, ...] = (), always_copies: b
 
 def compiled(jaxpr: ClosedJaxpr, batched: Sequence[bool] = (), always_copies: bool = False) -> Callable[..., list[Any]]:
     """The function as one that JAX calls; arguments and results as `written` has them."""
-    name = machine.register(written(jaxpr, tuple(batched), always_copies))
+    name = register(written(jaxpr, tuple(batched), always_copies), jaxpr)
     first = list(batched).index(True) if any(batched) else None
 
     def call(*xs: Any) -> list[Any]:

@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from ..emit import machine
+from ..emit.interface import batch_size, buffer
+from ..emit.runtime import alone, heap, in_threads
 from ..thresholds import THRESHOLDS
 from .access import store
 from .annotated import Annotated
@@ -47,35 +48,34 @@ class _Module:
             self._batch(place)
         else:
             self._store(self.lowering.run(self.jaxpr, self._arguments(None)), None, None)
-        found = [line for k in range(len(ins)) for line in machine.buffer("%args", k, f"arg{k}")]
-        found += [line for k in range(len(outs)) for line in machine.buffer("%results", k, f"result{k}")]
-        found += self._heap()
-        body = [*found, *memory.stack, "br label %start", "start:", *code.lines]
-        enough = THRESHOLDS.vectors_per_call * code.width
+        found = [line for k in range(len(ins)) for line in buffer("%args", k, f"arg{k}")]
+        found += [line for k in range(len(outs)) for line in buffer("%results", k, f"result{k}")]
+        taken, given_back = self._heap()
+        # What is on the stack belongs into the first block: elsewhere LLVM keeps none of it in registers.
+        body = [*found, *memory.stack, *taken, "br label %start", "start:", *code.lines, *given_back]
         functions = (
-            machine.in_threads(body, self.batched.index(True), enough)
+            in_threads(body, self._find_batch(), code.width)
             if lanes
-            else machine.alone(body, code.longest >= THRESHOLDS.long_loop)
+            else alone(body, code.longest >= THRESHOLDS.long_loop)
         )
         return "\n".join([*memory.constants, *code.declared.values(), *functions])
 
-    def _heap(self) -> list[str]:
-        """The instructions that take the memory of all arrays at once."""
+    def _find_batch(self) -> list[str]:
+        """The instructions that find the size of the batch."""
+        first = self.batched.index(True)
+        return [*buffer("%args", first, f"arg{first}"), *batch_size(f"arg{first}")]
+
+    def _heap(self) -> tuple[list[str], list[str]]:
+        """The instructions that take the memory of all arrays that are not on the stack, and that give it back."""
         code, size = self.code, self.memory.heap
         if size > THRESHOLDS.heap_bytes and self.limit < np.inf:
             raise TooLarge
         if not size:
-            return []
+            return [], []
         code.function("malloc", "ptr", "i64")
         code.function("free", "void", "ptr")
-        code.lines.append("call void @free(ptr %heap.raw)")
-        return [
-            f"%heap.raw = call ptr @malloc(i64 {size + 64})",
-            "%heap.int = ptrtoint ptr %heap.raw to i64",
-            "%heap.up = add i64 %heap.int, 63",
-            "%heap.aligned = and i64 %heap.up, -64",
-            "%heap = inttoptr i64 %heap.aligned to ptr",
-        ]
+        taken, given_back = heap(size)
+        return [*taken, *self.memory.on_heap], given_back
 
     def _arguments(self, row: Value | None) -> list[Any]:
         """The arguments, of the element that each lane has."""
@@ -109,7 +109,7 @@ class _Module:
         code, width = self.code, self.code.width
         size, last = Value("%batch", "i64"), Value("%batch.last", "i64")
         self.memory.stack += [
-            *machine.batch_size(f"arg{self.batched.index(True)}"),
+            *batch_size(f"arg{self.batched.index(True)}"),
             f"{last.name} = sub i64 {size.name}, 1",
         ]
         if place is not None:

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from jax.extend.core import Literal
 
-from ...emit.machine import has_symbol
+from ...emit.vector_math import has_symbol
 from ..arithmetic import convert
 from ..context import Context
 from ..dtypes import BYTES, FLOATS, INTEGERS, kind_of

@@ -31,3 +31,9 @@ def shift_right_arithmetic(context: Context, x: Any, by: Any, **_: Any) -> Value
     """The sign is shifted in, by the width and more everywhere."""
     code, kind = context.code, kind_of(context.dtype)
     return code.op("ashr", kind, x, code.intrinsic("umin", kind, by, 8 * BYTES[kind] - 1))
+
+
+@entrywise("population_count", INTEGERS)
+def bit_count(context: Context, x: Any, **_: Any) -> Value:
+    """How many bits are 1."""
+    return context.code.intrinsic("ctpop", kind_of(context.dtype), x)

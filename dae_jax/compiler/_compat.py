@@ -1,0 +1,31 @@
+"""All of JAX, XLA and equinox that the compiler leans on without being promised it.
+
+Beside it XLA's interface for foreign functions, which has a version (`emit/interface.py`).
+"""
+
+from typing import Any
+
+import jax
+from jax._src import xla_bridge
+from jax.interpreters.partial_eval import dce_jaxpr as dce_jaxpr
+
+
+def backends_are_initialised() -> bool:
+    """Whether JAX has chosen its devices, so that flags of XLA come too late."""
+    return xla_bridge.backends_are_initialized()
+
+
+def compilation_cache_folder() -> str | None:
+    """The folder of JAX's compilation cache, where it is on and on this machine's file system."""
+    folder = jax.config.values["jax_compilation_cache_dir"]
+    if not folder or "://" in folder or not jax.config.values["jax_enable_compilation_cache"]:
+        return None
+    return folder
+
+
+def is_check(eqn: Any) -> bool:
+    """Whether an equation is the call that raises in `equinox.error_if`."""
+    if eqn.primitive.name != "pure_callback":
+        return False
+    callback = getattr(eqn.params["callback"], "callback_func", None)
+    return getattr(callback, "__module__", None) == "equinox._errors"

@@ -1,0 +1,208 @@
+"""Compiled functions in this process: each is loaded when it is called, and let go when others have taken its room."""
+
+import ctypes
+import dataclasses
+import functools
+import hashlib
+import os
+import tempfile
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from ..settings import THREADS, current
+from . import object_cache
+from .object_code import key, object_code, parsed
+from .runtime import HANDLE, SHARE, STUBS, stubs, text as shared
+from .target import Target, host, llvm
+
+
+# Bytes of object code that are loaded at a time, of all programs; a solve takes 20 to 300 kB.
+BOUND = 64 * 2**20
+
+_lock = threading.RLock()
+# A child process finds the lock free.
+os.register_at_fork(before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_lock.release)
+_programs: dict[str, "_Program"] = {}
+
+
+@dataclasses.dataclass
+class _Program:
+    """A function: where it is entered, its object code in the spill file, and what is loaded of it."""
+
+    name: str
+    slot: int
+    handler: Any
+    size: int
+    place: tuple[Any, int] | None
+    engine: Any = None
+
+    @property
+    def last_use(self) -> int:
+        return ctypes.c_int64.from_address(self.slot + 16).value
+
+
+def register(module: str, source: Any = "") -> str:
+    """Compiles a module with a function `{name}.kernel`, and gives the name by which XLA calls it.
+
+    `source` is what the module was written from, for people to read.
+
+    `module` is a format string for `{name}`, which is made of its contents: equal programs are compiled once, also where
+    XLA's compilation cache holds the program that calls them.
+
+    Errors: `Unsupported` for a module that is broken.
+    """
+    target = host()
+    name = "dae_jax_" + hashlib.sha256(f"{target} {module}".encode()).hexdigest()[:32]
+    text = module.replace("{name}", name)
+    with _lock:
+        if current().dump is not None:
+            _dump(text, target, name, source)
+        if name not in _programs:
+            code = compiled(text, target)
+            slot, handler = _entrance()
+            program = _Program(name, slot, handler, len(code), _spilled(code))
+            _load(program, code)
+            jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler), platform="cpu")
+            _programs[name] = program
+    return name
+
+
+def handler(name: str) -> Callable[[int], int | None]:
+    """The handler of a registered program, which takes the address of a call frame and gives that of an error."""
+    return _programs[name].handler
+
+
+def guarded(fn: Callable[..., Any]) -> Callable[..., Any]:
+    """`fn`, in one thread at a time."""
+
+    @functools.wraps(fn)
+    def call(*args: Any) -> Any:
+        with _lock:
+            return fn(*args)
+
+    return call
+
+
+def compiled(text: str, target: Target, passes: bool = True) -> bytes:
+    """Object code, from the cache on disk where that has it."""
+    made_of = key(text, target, passes)
+    code = object_cache.load(made_of)
+    if code is None:
+        code = object_code(text, target, passes)
+        object_cache.keep(made_of, code)
+    return code
+
+
+def _dump(text: str, target: Target, name: str, source: Any) -> None:
+    """Writes a module, what it was written from, what LLVM's passes make of it, and its assembly to the settings' folder."""
+    show = lambda suffix, text: Path(current().dump or "", f"{name}.{suffix}").write_text(text)
+    show("jaxpr", str(source))
+    show("ll", text)
+    object_code(text, target, show=show)
+
+
+def engine(code: bytes, target: Target) -> Any:
+    """The machine code of an object file, in memory."""
+    loaded = llvm().create_mcjit_compiler(parsed(""), target.machine())
+    loaded.add_object_file(llvm().ObjectFileRef.from_data(code))
+    loaded.finalize_object()
+    return loaded
+
+
+class Runtime:
+    """What all programs share, loaded."""
+
+    def __init__(self) -> None:
+        target = host()
+        self.engine = engine(compiled(shared(), target, passes=False), target)
+        address = self.engine.get_function_address
+        for name in (HANDLE, SHARE):
+            llvm().add_symbol(name, address(name))
+        self.fill = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(address("fill"))
+        self.release = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p)(address("release"))
+        self.clock = ctypes.c_int64.from_address(self.engine.get_global_value_address("clock"))
+        self._loader = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p)(_load_again)
+        for name, value in (
+            ("limit.at", ctypes.addressof(THREADS)),
+            ("loader", ctypes.cast(self._loader, ctypes.c_void_p).value),
+        ):
+            ctypes.c_void_p.from_address(self.engine.get_global_value_address(name)).value = value
+        os.register_at_fork(after_in_child=ctypes.CFUNCTYPE(None)(address("forked")))
+        self.stubs = compiled(stubs(), target, passes=False)
+        self.entrances: list[tuple[int, Any]] = []
+
+
+@functools.cache
+def runtime() -> Runtime:
+    """The runtime of this process."""
+    return Runtime()
+
+
+# The engines of the handlers, which XLA keeps for the life of the process.
+_stub_engines: list[Any] = []
+
+
+def _entrance() -> tuple[int, Callable[..., Any]]:
+    """A slot and its handler."""
+    free = runtime().entrances
+    if not free:
+        block = engine(runtime().stubs, host())
+        _stub_engines.append(block)
+        slots = block.get_global_value_address("slots")
+        handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
+        free += [(slots + 64 * k, handler(block.get_function_address(f"stub{k}"))) for k in reversed(range(STUBS))]
+    return free.pop()
+
+
+def _load(program: _Program, code: bytes) -> None:
+    program.engine = engine(code, host())
+    shared = runtime()
+    shared.clock.value += 1
+    shared.fill(program.slot, program.engine.get_function_address(f"{program.name}.kernel"))
+    loaded = [p for p in _programs.values() if p.engine is not None and p is not program]
+    total = program.size + sum(p.size for p in loaded)
+    for old in sorted(loaded, key=lambda p: p.last_use):
+        if total <= BOUND:
+            return
+        if old.place is not None and shared.release(old.slot):
+            old.engine.close()
+            old.engine = None
+            total -= old.size
+
+
+def _load_again(slot: int) -> int:
+    """Called by the handler of a program whose code was let go; 0 where it cannot be loaded."""
+    with _lock:
+        program = next((p for p in _programs.values() if p.slot == slot), None)
+        if program is None:
+            return 0
+        if program.engine is None:
+            file, start = program.place
+            code = os.pread(file.fileno(), program.size, start)
+            if len(code) < program.size:
+                return 0
+            _load(program, code)
+    return 1
+
+
+# Where the object code of this process is kept: files without a name, which end with the process.
+_spills: list[Any] = []
+os.register_at_fork(after_in_child=_spills.clear)
+
+
+def _spilled(code: bytes) -> tuple[Any, int] | None:
+    """The file that the object code was written to, and where in it; `None` where there is no room."""
+    try:
+        if not _spills:
+            _spills.append(tempfile.TemporaryFile())  # noqa: SIM115
+        file = _spills[-1]
+        start = file.seek(0, os.SEEK_END)
+        file.write(code)
+        file.flush()
+    except OSError:
+        return None
+    return file, start
