@@ -149,6 +149,8 @@ def _index(draw: Draw, n: int, shape: Any = ()) -> Operand:
 
 @recipe("dynamic_slice dynamic_update_slice", ALL)
 def window(name: str, dtype: str, draw: Draw) -> Operation:
+    if name == "dynamic_update_slice" and draw.chance(0.3):
+        return _onto_itself(name, dtype, draw)
     x = Operand(dtype, draw.shape(1))
     sizes = [draw.below(n + 1) if draw.chance(0.2) else min(n, 1 + draw.below(4)) for n in x.shape]
     starts = [_index(draw, n)._replace(dtype="int32" if d else _index(draw, n).dtype) for d, n in enumerate(x.shape)]
@@ -158,6 +160,19 @@ def window(name: str, dtype: str, draw: Draw) -> Operation:
     update = x._replace(shape=tuple(sizes))
     fn = lambda a, u, *at: lax.dynamic_update_slice(a, u, at)
     return Operation(name, fn, (x, update, *starts), smooth=dtype in FLOATS)
+
+
+def _onto_itself(name: str, dtype: str, draw: Draw) -> Operation:
+    """An array that nothing else reads, changed by a piece of it that lies over what it is written to."""
+    n = draw.one_of([25, 30, 60])
+    first, size = draw.below(3), n - 4 - draw.below(5)
+    turned = lambda a: lax.concatenate([a[1:], a[:1]], 0)
+    if name == "scatter":
+        at = first + 1 + draw.below(3)
+        fn = lambda a: (y := turned(a)).at[at + jnp.arange(min(size, n - at))].set(y[first:][: min(size, n - at)])
+        return Operation(name, fn, (Operand(dtype, (n,)),))
+    fn = lambda a, i: lax.dynamic_update_slice(y := turned(a), y[first:][:size], (i,))
+    return Operation(name, fn, (Operand(dtype, (n,)), Operand("int32", (), 6)))
 
 
 @recipe("gather", ALL)
@@ -191,6 +206,8 @@ def gathering(name: str, dtype: str, draw: Draw) -> Operation:
 @recipe("scatter-min scatter-max", (*FLOATS, *INTEGERS))
 def scattering(name: str, dtype: str, draw: Draw) -> Operation:
     """What is written to one place twice is the same, or added up."""
+    if name == "scatter" and draw.chance(0.3):
+        return _onto_itself(name, dtype, draw)
     x = Operand(dtype, tuple(max(n, 1) for n in draw.shape(1)), "plain")
     axis = draw.below(len(x.shape))
     n, mode = x.shape[axis], draw.one_of(["clip", "drop"])

@@ -1,4 +1,4 @@
-"""Programs run by our compiler, alone and in batches, and by XLA."""
+"""Programs run by our compiler, alone and in batches of two sizes, and by XLA."""
 
 import dataclasses
 import functools
@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from dae_jax.compiler.emit import machine
+from dae_jax.compiler.emit import target
 from dae_jax.compiler.lower import compiled, unsupported
 
 from .compare import difference
@@ -16,7 +16,7 @@ from .numbers import Draw
 from .programs import Program
 
 
-WIDTH = machine.vector_size()
+WIDTH = target.vector_size()
 BATCHES = (1, WIDTH, WIDTH + 1, 2 * WIDTH + 3)
 # A quarter of the time to compile, and the same answers.
 _QUICK = {
@@ -56,14 +56,6 @@ def _options() -> dict[str, Any]:
     return _QUICK
 
 
-@functools.cache
-def refused(program: Program) -> str | None:
-    """Why the compiler does not take it, by what it says of it."""
-    first = [x if s else x[0] for x, s in zip(arguments(program), program.shared, strict=True)]
-    found = unsupported(jax.make_jaxpr(program.fn)(*first))
-    return str(found[0]) if found else None
-
-
 def by_xla(fn: Any, args: Sequence[Any], shared: Sequence[bool]) -> list[Any]:
     """Element after element."""
     batched = [x for x, s in zip(args, shared, strict=True) if not s]
@@ -80,10 +72,7 @@ def by_xla(fn: Any, args: Sequence[Any], shared: Sequence[bool]) -> list[Any]:
 
 
 def differences(programs: Sequence[Program]) -> list[Difference]:
-    """What the programs, compiled together, give otherwise than by XLA."""
-    programs = [p for p in programs if not refused(p)]
-    if not programs:
-        return []
+    """What the programs, compiled together, give otherwise than by XLA. Errors: `Unsupported` for what the compiler refuses."""
     args = [arguments(p) for p in programs]
     ends = np.cumsum([len(a) for a in args]).tolist()
 
@@ -93,6 +82,8 @@ def differences(programs: Sequence[Program]) -> list[Difference]:
     flat, shared = [x for a in args for x in a], [s for p in programs for s in p.shared]
     first = [x if s else x[0] for x, s in zip(flat, shared, strict=True)]
     jaxpr, shape = jax.make_jaxpr(fn, return_shape=True)(*first)
+    if not_taken := unsupported(jaxpr):
+        raise not_taken[0]
     wanted = jax.tree.leaves(by_xla(fn, flat, shared))
     of = [p for p, out in zip(programs, shape, strict=True) for _ in out]
     number = [k for out in shape for k in range(len(out))]
@@ -110,5 +101,5 @@ def differences(programs: Sequence[Program]) -> list[Difference]:
 def _ours(jaxpr: Any, args: Any, first: Any, shared: Any, copies: bool) -> Any:
     yield None, jax.jit(compiled(jaxpr, (), copies))(*first)
     lanes = jax.jit(compiled(jaxpr, tuple(not s for s in shared), copies))
-    for n in BATCHES:
+    for n in (BATCHES[len(args) % 3], BATCHES[-1]):
         yield n, lanes(*(x if s else x[:n] for x, s in zip(args, shared, strict=True)))

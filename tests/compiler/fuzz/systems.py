@@ -59,6 +59,7 @@ def mechanism(seed: int) -> Problem:
     """A tree of one to three point masses, held by rods and springs, in two or three dimensions, at rest at first."""
     draw = Draw(seed, 10)
     solver, fixed = draw.one_of(_MECHANICAL)
+    symplectic = isinstance(solver, dae_jax.RATTLE)
     n, d = 1 + draw.below(3), 2 + draw.below(2)
     parents = [draw.below(i + 1) - 1 for i in range(n)]
     rigid = np.array([i == 0 or draw.chance(0.6) for i in range(n)])
@@ -67,7 +68,7 @@ def mechanism(seed: int) -> Problem:
         along = draw.rng.normal(size=d)
         at[i] = (at[parent] if parent >= 0 else 0) + draw.rng.uniform(0.5, 1.5) * along / np.linalg.norm(along)
     args = {"stiffness": draw.rng.uniform(5, 50, n), "drag": draw.rng.uniform(0, 0.5), "mass": draw.rng.uniform(0.5, 2, n)}
-    args, lengths = jax.tree.map(jnp.asarray, args), None
+    args = jax.tree.map(jnp.asarray, args)
     push, wind = draw.one_of([jnp.sin, jnp.tanh, jnp.cos, lambda t: t**2, lambda t: jnp.where(t > 0.3, t, 0.3)]), draw.chance(0.5)
 
     def spans(q: Any) -> Any:
@@ -85,12 +86,13 @@ def mechanism(seed: int) -> Problem:
             if p >= 0:
                 pull = pull.at[p].add(stretch[i] * s[i])
         pull = pull.at[0, 0].add(push(3 * t)) if wind else pull
-        return pull.reshape(-1) - args["drag"] * v * jnp.sqrt(1e-3 + jnp.sum(v**2))
+        pull = pull.reshape(-1)
+        return pull if symplectic else pull - args["drag"] * v * jnp.sqrt(1e-3 + jnp.sum(v**2))
 
     system = dae_jax.ConstrainedSystem(
         force=force,
         constraint=lambda t, q, args: (jnp.sum(spans(q) ** 2, 1) - lengths)[np.flatnonzero(rigid)] / 2,
-        mass=jnp.repeat(args["mass"], d) if type(solver) is dae_jax.RATTLE else lambda q, args: jnp.repeat(args["mass"], d),
+        mass=jnp.repeat(args["mass"], d) if symplectic else lambda q, args: jnp.repeat(args["mass"], d),
     )
     name = f"mechanism {seed}: {n} masses in {d} dimensions, {type(solver).__name__}"
     return Problem(name, system, solver, (jnp.asarray(at).reshape(-1), jnp.zeros(n * d)), args, fixed)
