@@ -29,3 +29,13 @@ def is_check(eqn: Any) -> bool:
         return False
     callback = getattr(eqn.params["callback"], "callback_func", None)
     return getattr(callback, "__module__", None) == "equinox._errors"
+
+
+def is_key(aval: Any) -> bool:
+    """Whether an array is one of random keys."""
+    return jax.numpy.issubdtype(getattr(aval, "dtype", bool), jax.dtypes.prng_key)
+
+
+def key_functions(dtype: Any) -> Any:
+    """The generator of a type of keys: its `key_shape`, `seed`, `split`, `fold_in`, `random_bits`, of the numbers of a key."""
+    return dtype._impl

@@ -7,7 +7,9 @@ import jax
 import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
 
+from .random_keys import without_keys
 from .scalar_interpreter import CALLS as OF_CALLS
+from .special_functions import SPECIAL, by_simpler_ones
 
 
 CALLS = {**OF_CALLS, "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "custom_vmap_call": "call"}
@@ -21,12 +23,11 @@ _GIVES = {
 _BY_OTHERS = frozenset({"unvmap_any", "unvmap_all", "maybe_set"})
 _SAME_IF_SO_SHAPED = frozenset({"reshape", "broadcast_in_dim", "convert_element_type", "squeeze", "expand_dims"})
 _COMMUTATIVE = frozenset({"add", "add_any", "mul", "max", "min", "and", "or", "xor", "eq", "ne"})
-KNOWN = CALLS.keys() | _GIVES.keys() | _BY_OTHERS | {"custom_linear_solve"}
 
 
 def inlined(closed: ClosedJaxpr) -> ClosedJaxpr:
     """A jaxpr that computes the same."""
-    flat = _Flat()
+    closed, flat = without_keys(closed), _Flat()
     inputs = [Var(v.aval) for v in closed.jaxpr.invars]
     outputs = flat.run(closed, inputs)
     needed, eqns = {v for v in outputs if isinstance(v, Var)}, []
@@ -62,6 +63,8 @@ class _Flat:
             return self.run(inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ()), args)
         if name in _GIVES:
             return [args[_GIVES[name]]]
+        if name in SPECIAL:
+            return self.run(by_simpler_ones(eqn), args)
         if name == "custom_linear_solve":
             return self.run(p["jaxprs"].solve, of_solve(p, args))
         if name in _BY_OTHERS:

@@ -40,9 +40,18 @@ def converted(x: Any, dtype: Any) -> Any:
 
 def on_numbers(eqn: Any, values: list[Any]) -> np.ndarray | None:
     """What an equation of a jaxpr with one output gives for numbers; `None` where numpy may see that differently."""
-    name, dtype = eqn.primitive.name, eqn.outvars[0].aval.dtype
-    function = _EXACT.get(name) or (_OF_FLOATS.get(name) if jnp.issubdtype(dtype, jnp.floating) else None)
+    function = _of_numbers(eqn)
     if function is None:
         return None
     with np.errstate(all="ignore"):
-        return np.asarray(function(*values), dtype)
+        return np.asarray(function(*values), eqn.outvars[0].aval.dtype)
+
+
+def is_on_numbers(eqn: Any) -> bool:
+    """Whether `on_numbers` gives something."""
+    return _of_numbers(eqn) is not None
+
+
+def _of_numbers(eqn: Any) -> Any:
+    name, is_float = eqn.primitive.name, jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.floating)
+    return _EXACT.get(name) or (_OF_FLOATS.get(name) if is_float else None)

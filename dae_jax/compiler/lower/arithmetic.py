@@ -17,8 +17,8 @@ _OF_FLOATS = {"add": "fadd contract", "sub": "fsub contract", "mul": "fmul contr
 _OF_TRUTH_VALUES = {"add": "or", "mul": "and", "max": "or", "min": "and"}
 _COMPARISONS = {"eq": "oeq", "ne": "une", "lt": "olt", "le": "ole", "gt": "ogt", "ge": "oge"}
 _KNOWN = {
-    "add": np.add, "mul": np.multiply, "max": np.maximum, "min": np.minimum, "and": np.bitwise_and,
-    "or": np.bitwise_or, "xor": np.bitwise_xor,
+    "add": np.add, "sub": np.subtract, "mul": np.multiply, "max": np.maximum, "min": np.minimum, "and": np.bitwise_and,
+    "or": np.bitwise_or, "xor": np.bitwise_xor, "logaddexp": np.logaddexp,
 }  # fmt: skip
 
 
@@ -27,6 +27,8 @@ def applied(code: Instructions, name: str, dtype: np.dtype, a: Any, b: Any) -> A
     if dtype.kind == "c":
         return complex_arithmetic.OPERATIONS[name](code, kind_of(part(dtype)), a, b)
     kind = kind_of(dtype)
+    if name == "logaddexp":
+        return _log_of_sum(code, kind, a, b)
     if kind == "i1":
         name = _OF_TRUTH_VALUES.get(name, name)
     if name in ("max", "min"):
@@ -40,7 +42,7 @@ def applied(code: Instructions, name: str, dtype: np.dtype, a: Any, b: Any) -> A
 
 
 def combined(code: Instructions, name: str, dtype: np.dtype, a: Any, b: Any) -> Any:
-    """The same of numbers that may be known both, by `add`, `mul`, `max`, `min`, `and`, `or` or `xor`."""
+    """The same of numbers that may be known both, by `logaddexp` too; `div` and `rem` are not."""
     if is_number(a) and is_number(b):
         with np.errstate(all="ignore"):
             return _KNOWN[name](a, b)
@@ -60,6 +62,16 @@ def _of_floats(code: Instructions, name: str, kind: str, a: Any, b: Any) -> Valu
         if isinstance(value, Value) and not isinstance(number, Value) and _is_power_of_two(number):
             return code.scaled(value, float(number) if name == "mul" else 1 / float(number), kind)
     return code.op(_OF_FLOATS[name], kind, a, b)
+
+
+def _log_of_sum(code: Instructions, kind: str, a: Any, b: Any) -> Value:
+    """log(eᵃ + eᵇ)."""
+    largest = code.intrinsic("maximum", kind, a, b)
+    apart = code.intrinsic("fabs", kind, code.op("fsub", kind, a, b))
+    more = code.library("log1p", kind, code.library("exp", kind, code.op("fneg", kind, apart)))
+    # Of two infinities of one sign the difference is none.
+    undefined = code.op("fcmp uno", kind, apart, apart, result="i1")
+    return code.select(undefined, code.op("fadd", kind, a, b), code.op("fadd", kind, largest, more), kind)
 
 
 def _quotient(code: Instructions, name: str, dtype: np.dtype, a: Any, b: Any) -> Value:

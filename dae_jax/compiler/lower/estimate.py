@@ -8,6 +8,7 @@ from typing import Any
 from jax.extend.core import ClosedJaxpr, Literal, Var
 
 from ..emit.target import vector_size
+from ..jaxprs.numbers import is_on_numbers
 from ..jaxprs.walk import equations
 from ..thresholds import THRESHOLDS
 from .annotated import Annotated, Note
@@ -82,15 +83,15 @@ class _Estimate:
     def _of_equation(self, eqn: Any, args: set[str], uses: int) -> tuple[str, int]:
         """Where the results are, and about how many instructions they take."""
         rule, largest = RULES[eqn.primitive.name], max(v.aval.size for v in eqn.outvars)
-        known = rule.moves and args <= {"known"} and largest <= THRESHOLDS.folded
-        if known:
+        folds = rule.moves or is_on_numbers(eqn)
+        if folds and args <= {"known"} and largest <= THRESHOLDS.folded:
             return "known", 0
         if not args & {"memory", "fused"} and largest <= THRESHOLDS.in_registers:
-            return "registers", rule.cost(eqn)
+            return "memory" if rule.by_memory and not args <= {"known"} else "registers", rule.cost(eqn)
         fuses = rule.fuses or (rule.moves and "fused" in args and eqn.primitive.name not in _MAKE_ARRAYS)
         of_entry = min(max(rule.cost(eqn) // max(size(eqn), 1), 1), 2 * THRESHOLDS.carried)
         cost = sum(min(v.aval.size, THRESHOLDS.loop_cost) for v in eqn.outvars) * of_entry
-        return ("fused" if fuses and uses == 1 else "memory" if largest > self.few else "registers"), cost
+        return ("fused" if fuses and uses == 1 else "memory" if rule.moves or largest > self.few else "registers"), cost
 
     def _nested(self, eqn: Any, args: list[_State], varying: list[bool], depth: int, times: int) -> list[_State]:
         p, outs = eqn.params, [self.loaded(v.aval, each) for v, each in zip(eqn.outvars, varying, strict=True)]

@@ -56,13 +56,15 @@ class Lowering:
             large = rule.nested or self._is_large(rule, eqn, args)
             args = args if large else list(map(self.memory.entries, args))
             out = rule.lower(Context(self, eqn, large), *args, **eqn.params)
+            out = out if isinstance(out, list) else [out]
+            _check(eqn, out)
         except (TooLarge, LoweringError):
             raise
         except Exception as error:
             raise LoweringError(f"The rule of `{eqn.primitive.name}` failed at {quoted(eqn)}: {error!r}") from error
         if len(self.code.lines) > self._limit:
             raise TooLarge
-        return out if isinstance(out, list) else [out]
+        return out
 
     def _is_large(self, rule: Rule, eqn: Any, args: list[Any]) -> bool:
         """Whether an operand is in memory, or the result is so large that it shall be."""
@@ -70,6 +72,14 @@ class Lowering:
         if largest > THRESHOLDS.folded or (largest > THRESHOLDS.in_registers and not _stays_known(rule, eqn, args)):
             return True
         return any(not isinstance(a, np.ndarray) and a.size > self.memory.few for a in args)
+
+
+def _check(eqn: Any, out: list[Any]) -> None:
+    """What has another shape or type than the equation says would be read and written past its end."""
+    for v, x in zip(eqn.outvars, out, strict=True):
+        dtype = v.aval.dtype if isinstance(x, np.ndarray) else x.dtype
+        if tuple(x.shape) != tuple(v.aval.shape) or dtype != v.aval.dtype:
+            raise AssertionError(f"it gave {dtype}{list(x.shape)}")
 
 
 def _stays_known(rule: Rule, eqn: Any, args: list[Any]) -> bool:

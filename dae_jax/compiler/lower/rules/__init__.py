@@ -1,6 +1,7 @@
 """The rules, by kind of primitive; importing this enters them into the table."""
 
 from . import (
+    bits as bits,
     branches as branches,
     contractions as contractions,
     elementwise as elementwise,

@@ -3,7 +3,6 @@
 from typing import Any
 
 import numpy as np
-from jax.extend.core import Literal
 
 from ...emit.vector_math import has_symbol
 from ..arithmetic import convert
@@ -23,7 +22,7 @@ def _in_library(eqn: Any) -> str | None:
 
 
 @entrywise(
-    "sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp exp2 expm1 log log1p cbrt erf erfc atan2",
+    "sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp exp2 expm1 log log1p cbrt erf erfc atan2 lgamma",
     FLOATS, requires=_in_library,
 )  # fmt: skip
 def library(context: Context, *x: Any, **_: Any) -> Value:
@@ -102,13 +101,3 @@ def nextafter(context: Context, x: Any, y: Any, **_: Any) -> Any:
     same = code.op("fcmp oeq", kind, x, y, result="i1")
     undefined = code.op("fcmp uno", kind, x, y, result="i1")
     return code.select(undefined, code.op("fadd", kind, x, y), code.select(same, y, moved, kind), kind)
-
-
-def _of_literal(eqn: Any) -> str | None:
-    return None if isinstance(eqn.invars[0], Literal) else "`lgamma` is written for known numbers only"
-
-
-@entrywise("lgamma", FLOATS, requires=_of_literal)
-def lgamma(*_: Any, **__: Any) -> Any:
-    """Of known numbers only, as the factorials of Taylor arithmetic are: nothing is written for these."""
-    raise AssertionError

@@ -13,7 +13,7 @@ from ..arithmetic import combined, total
 from ..arrays import Fused, View, shared
 from ..blocks import for_each
 from ..context import Context
-from ..dtypes import ALL, BOOL, INTEGERS, NUMBERS
+from ..dtypes import ALL, BOOL, INTEGERS, NUMBERS, REALS
 from ..indices import indices_of, places_of, window_start
 from ..instructions import Value
 from ..registry import rule
@@ -56,8 +56,7 @@ def _added(context: Context, before: Any, update: Any) -> Any:
 
 
 def _combined(context: Context, before: Any, update: Any) -> Any:
-    name = context.name.removeprefix("scatter-").replace("scatter_", "")
-    return combined(context.code, name, context.to, before, update)
+    return combined(context.code, context.name.removeprefix("scatter-"), context.to, before, update)
 
 
 @rule("scatter", (ALL, INTEGERS, ALL), by_memory=True)
@@ -70,6 +69,18 @@ def scatter(context: Context, x: Any, indices: Any, update: Any, **_: Any) -> An
 def scatter_add(context: Context, x: Any, indices: Any, update: Any, **_: Any) -> Any:
     """An array with something added to entries."""
     return _scattered(context, x, indices, update, _added)
+
+
+@rule("scatter-sub scatter-mul", (NUMBERS, INTEGERS, NUMBERS), by_memory=True)
+def scatter_arithmetic(context: Context, x: Any, indices: Any, update: Any, **_: Any) -> Any:
+    """An array with entries less something, or times something."""
+    return _scattered(context, x, indices, update, _combined)
+
+
+@rule("scatter-min scatter-max", (REALS | BOOL, INTEGERS, REALS | BOOL), by_memory=True)
+def scatter_extremum(context: Context, x: Any, indices: Any, update: Any, **_: Any) -> Any:
+    """An array with entries replaced by what is smaller, or larger."""
+    return _scattered(context, x, indices, update, _combined)
 
 
 Combine = Callable[[Context, Any, Any], Any]

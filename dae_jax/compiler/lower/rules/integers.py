@@ -37,3 +37,13 @@ def shift_right_arithmetic(context: Context, x: Any, by: Any, **_: Any) -> Value
 def bit_count(context: Context, x: Any, **_: Any) -> Value:
     """How many bits are 1."""
     return context.code.intrinsic("ctpop", kind_of(context.dtype), x)
+
+
+@entrywise("clz", INTEGERS)
+def leading_zeros(context: Context, x: Any, **_: Any) -> Value:
+    """How many of the first bits are 0."""
+    code, kind = context.code, kind_of(context.dtype)
+    x = code.copy(x, kind)
+    vector = code.type(kind, x.lanes)
+    function = code.function(f"llvm.ctlz.{f'v{code.width}' if x.lanes else ''}{kind}", vector, vector, "i1")
+    return code.pure(f"call {vector} {function}({vector} {x.name}, i1 false)", kind, x.lanes)

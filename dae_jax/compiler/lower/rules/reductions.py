@@ -15,14 +15,15 @@ from ..arithmetic import applied, better, combined, convert, identity
 from ..arrays import Fused, View
 from ..blocks import accumulated, for_each
 from ..context import Context
-from ..dtypes import BOOL, INTEGERS, NUMBERS, REALS, kind_of, parts_of
+from ..dtypes import BOOL, FLOATS, INTEGERS, NUMBERS, REALS, kind_of, parts_of
 from ..instructions import Complex, parts
 from ..registry import rule
 
 
 _FOLDS = {
     "reduce_sum": "add", "reduce_max": "max", "reduce_min": "min", "reduce_prod": "mul", "reduce_and": "and",
-    "reduce_or": "or", "cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min",
+    "reduce_or": "or", "reduce_xor": "xor", "cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min",
+    "cumlogsumexp": "logaddexp",
 }  # fmt: skip
 
 
@@ -51,7 +52,7 @@ def extremum(context: Context, x: Any, *, axes: Sequence[int], **_: Any) -> Any:
     return _in_memory(context, x, axes) if context.large else _in_registers(context, x, axes)
 
 
-@rule("reduce_and reduce_or", INTEGERS | BOOL, cost=operand_size)
+@rule("reduce_and reduce_or reduce_xor", INTEGERS | BOOL, cost=operand_size)
 def bitwise(context: Context, x: Any, *, axes: Sequence[int], **_: Any) -> Any:
     """Bit by bit along axes."""
     return _in_memory(context, x, axes) if context.large else _in_registers(context, x, axes)
@@ -126,6 +127,12 @@ def folded(context: Context, name: str, shape: Sequence[int], first: Any, entry:
 @rule("cumsum cumprod", NUMBERS, cost=operand_size)
 def running_total(context: Context, x: Any, *, axis: int, reverse: bool) -> Any:
     """The sum or the product of all entries up to here."""
+    return _running_in_memory(context, x, axis, reverse) if context.large else _running(context, x, axis, reverse)
+
+
+@rule("cumlogsumexp", FLOATS, cost=operand_size)
+def running_log_of_sum(context: Context, x: Any, *, axis: int, reverse: bool) -> Any:
+    """The logarithm of the sum of the exponentials of all entries up to here."""
     return _running_in_memory(context, x, axis, reverse) if context.large else _running(context, x, axis, reverse)
 
 
