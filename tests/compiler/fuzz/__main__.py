@@ -1,6 +1,6 @@
 """python -m tests.compiler.fuzz FIRST LAST: the programs of these seeds, and the smallest part of each that differs.
 
-A seed is one program for each primitive on each type of numbers and 300 compositions, about 1,000 in all.
+A seed is one program for each primitive on each type of numbers and 100 compositions, about 950 in all.
 """
 
 import os

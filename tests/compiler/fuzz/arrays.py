@@ -129,6 +129,13 @@ def accumulated(name: str, dtype: str, draw: Draw) -> Operation:
     return Operation(name, fn, (x,), smooth=dtype in FLOATS and name == "cumsum")
 
 
+@recipe("cumlogsumexp", FLOATS)
+def logarithmic(name: str, dtype: str, draw: Draw) -> Operation:
+    x = Operand(dtype, draw.shape(1, draw.one_of([1, 3, 8, 25])), "plain")
+    axis, reverse = draw.below(len(x.shape)), draw.chance(0.5)
+    return Operation(name, lambda a: lax.cumlogsumexp(a, axis=axis, reverse=reverse), (x,), 64)
+
+
 @recipe("dot_general", _NUMBERS)
 def product(name: str, dtype: str, draw: Draw) -> Operation:
     b, m, n = (draw.one_of([1, 2, 3]) for _ in range(3))
@@ -202,7 +209,7 @@ def gathering(name: str, dtype: str, draw: Draw) -> Operation:
 
 
 @recipe("scatter", ALL)
-@recipe("scatter-add scatter-mul", _NUMBERS)
+@recipe("scatter-add scatter-mul scatter-sub", _NUMBERS)
 @recipe("scatter-min scatter-max", (*FLOATS, *INTEGERS))
 def scattering(name: str, dtype: str, draw: Draw) -> Operation:
     """What is written to one place twice is the same, or added up."""
@@ -212,10 +219,10 @@ def scattering(name: str, dtype: str, draw: Draw) -> Operation:
     axis = draw.below(len(x.shape))
     n, mode = x.shape[axis], draw.one_of(["clip", "drop"])
     at = _index(draw, n, draw.one_of([(), (1,), (3,), (9,)]))
-    how = {"scatter": "set", "scatter-add": "add", "scatter-mul": "mul", "scatter-min": "min", "scatter-max": "max"}[name]
+    how = {"scatter": "set", "scatter-sub": "subtract", "scatter-mul": "multiply"}.get(name, name[8:])
     kept = tuple(m for d, m in enumerate(x.shape) if d != axis)
     shape = (*kept[:axis], *at.shape, *kept[axis:]) if name != "scatter" else (*kept[:axis], *[1] * len(at.shape), *kept[axis:])
-    update, where = x._replace(shape=shape, domain="units" if how == "mul" else "plain"), (slice(None),) * axis
+    update, where = x._replace(shape=shape, domain="units" if how == "multiply" else "plain"), (slice(None),) * axis
 
     def one(a: Any, u: Any, i: Any) -> Any:
         return getattr(a.at[(*where, i)], how)(jnp.broadcast_to(u, a[(*where, jnp.zeros(at.shape, int))].shape), mode=mode)
@@ -237,3 +244,10 @@ def sorting(name: str, dtype: str, draw: Draw) -> Operation:
     x = Operand(dtype, draw.shape(1, draw.one_of([1, 3, 8, 24, 25])))
     axis = draw.below(len(x.shape))
     return Operation(name, lambda a: lax.sort(a, dimension=axis), (x,))
+
+
+@recipe("threefry2x32", ("uint32",))
+def random_bits(name: str, dtype: str, draw: Draw) -> Operation:
+    shape = draw.shape(0, draw.one_of([1, 3, 8, 25]))
+    fn = lambda key: jax.random.bits(jax.random.wrap_key_data(key), shape)
+    return Operation(name, fn, (Operand(dtype, (2,)),))

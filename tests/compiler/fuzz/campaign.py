@@ -12,7 +12,7 @@ from .shrink import shrunk
 
 # As many compile together; more take LLVM longer than each by itself.
 TOGETHER = 32
-COMPOSED = 300
+COMPOSED = 100
 
 
 def of_seed(seed: int) -> Iterator[Program]:

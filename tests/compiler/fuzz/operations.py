@@ -44,13 +44,13 @@ def recipe(names: str, dtypes: Sequence[str]) -> Callable[[Recipe], Recipe]:
 ULPS = {
     "acos": 4, "acosh": 32, "asin": 4, "asinh": 32, "atan": 4, "atan2": 8, "atanh": 32, "cbrt": 8, "cos": 8, "cosh": 16, "erf": 16,
     "erfc": 64, "exp": 8, "exp2": 16, "expm1": 16, "log": 8, "log1p": 16, "logistic": 16, "pow": 64, "rsqrt": 4, "sin": 8, "sinh": 16,
-    "tan": 16, "tanh": 16,
+    "tan": 16, "tanh": 16, "digamma": 256, "erf_inv": 64, "lgamma": 256,
 }  # fmt: skip
 
 
 @recipe(" ".join(ULPS.keys() - {"atan2", "pow"}), FLOATS)
 def of_library(name: str, dtype: str, draw: Draw) -> Operation:
-    return Operation(name, getattr(lax, name), (Operand(dtype, draw.shape()),), ULPS[name], name != "acosh")
+    return Operation(name, getattr(lax, name), (Operand(dtype, draw.shape()),), ULPS[name], name not in ("acosh", "digamma"))
 
 
 @recipe("atan2 nextafter", FLOATS)
@@ -194,3 +194,24 @@ def counting(name: str, dtype: str, draw: Draw) -> Operation:
     return Operation(name, lambda a: a + lax.broadcasted_iota(dtype, shape, axis), (x,))
 
 
+
+
+@recipe("eq_to le_to lt_to", (*FLOATS, *INTEGERS))
+def total_order(name: str, dtype: str, draw: Draw) -> Operation:
+    x = Operand(dtype, draw.shape())
+    return Operation(name, getattr(lax, f"{name}_p").bind, (x, x))
+
+
+@recipe("bitcast_convert_type", (*FLOATS, *INTEGERS))
+def same_bits(name: str, dtype: str, draw: Draw) -> Operation:
+    bits = 8 * np.dtype(dtype).itemsize
+    to = draw.one_of([d for d in (*FLOATS, *INTEGERS) if 8 * np.dtype(d).itemsize == bits])
+    # Bits of integers may be those of numbers that are flushed to 0.
+    to = to if dtype in FLOATS else to if to in INTEGERS else dtype
+    return Operation(name, lambda x: lax.bitcast_convert_type(x, to), (Operand(dtype, draw.shape()),))
+
+
+@recipe("reduce_precision", FLOATS)
+def less_precise(name: str, dtype: str, draw: Draw) -> Operation:
+    exponent, mantissa = draw.one_of([(5, 10), (8, 7), (8, 23), (11, 52), (4, 3)])
+    return Operation(name, lambda x: lax.reduce_precision(x, exponent, mantissa), (Operand(dtype, draw.shape()),))

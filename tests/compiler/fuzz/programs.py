@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from dae_jax.compiler.jaxprs.special_functions import SPECIAL
 from dae_jax.compiler.lower.registry import RULES
 
 from . import arrays as arrays
@@ -18,8 +19,12 @@ from .numbers import Draw, Operand
 from .operations import RECIPES, Operation
 
 
-# What the compiler claims.
-CLAIMED = sorted((name, dtype) for name, dtype in RECIPES if name in RULES and dtype in frozenset().union(*RULES[name].dtypes))
+# What the compiler says that it takes: by a rule, or by simpler primitives.
+CLAIMED = sorted(
+    (name, dtype)
+    for name, dtype in RECIPES
+    if name in SPECIAL or (name in RULES and dtype in frozenset().union(*RULES[name].dtypes))
+)
 
 
 @dataclasses.dataclass(frozen=True)
