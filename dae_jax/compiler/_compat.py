@@ -6,6 +6,7 @@ Beside it XLA's interface for foreign functions, which has a version (`emit/inte
 from typing import Any
 
 import jax
+import numpy as np
 from jax._src import xla_bridge
 from jax.interpreters.partial_eval import dce_jaxpr as dce_jaxpr
 
@@ -33,7 +34,8 @@ def is_check(eqn: Any) -> bool:
 
 def is_key(aval: Any) -> bool:
     """Whether an array is one of random keys."""
-    return jax.numpy.issubdtype(getattr(aval, "dtype", bool), jax.dtypes.prng_key)
+    dtype = getattr(aval, "dtype", bool)
+    return not isinstance(dtype, np.dtype | type) and jax.numpy.issubdtype(dtype, jax.dtypes.prng_key)
 
 
 def key_functions(dtype: Any) -> Any:

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
 
-from .random_keys import without_keys
 from .scalar_interpreter import CALLS as OF_CALLS
 from .special_functions import SPECIAL, by_simpler_ones
 
@@ -27,7 +26,7 @@ _COMMUTATIVE = frozenset({"add", "add_any", "mul", "max", "min", "and", "or", "x
 
 def inlined(closed: ClosedJaxpr) -> ClosedJaxpr:
     """A jaxpr that computes the same."""
-    closed, flat = without_keys(closed), _Flat()
+    flat = _Flat()
     inputs = [Var(v.aval) for v in closed.jaxpr.invars]
     outputs = flat.run(closed, inputs)
     needed, eqns = {v for v in outputs if isinstance(v, Var)}, []
@@ -129,7 +128,7 @@ def _key(params: Any) -> Hashable:
 
 def _atom(x: Any) -> Hashable:
     # By its text: 0 and −0 are equal, and not the same.
-    return (repr(x.val), str(x.aval)) if isinstance(x, Literal) else x
+    return (repr(x.val), x.aval.dtype) if isinstance(x, Literal) else x
 
 
 def _meaning(eqn: Any) -> ClosedJaxpr:

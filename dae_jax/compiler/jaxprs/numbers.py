@@ -53,5 +53,7 @@ def is_on_numbers(eqn: Any) -> bool:
 
 
 def _of_numbers(eqn: Any) -> Any:
-    name, is_float = eqn.primitive.name, jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.floating)
-    return _EXACT.get(name) or (_OF_FLOATS.get(name) if is_float else None)
+    name = eqn.primitive.name
+    if name in _OF_FLOATS and jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.floating):
+        return _OF_FLOATS[name]
+    return _EXACT.get(name)

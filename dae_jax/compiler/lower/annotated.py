@@ -1,24 +1,31 @@
 """A function with what it will be compiled to."""
 
 import dataclasses
+from typing import Any
 
 from jax.extend.core import ClosedJaxpr
 
 from ..emit.target import vector_size
 from .inlining import Inlining
+from .registry import quoted
 
 
 @dataclasses.dataclass(frozen=True)
 class Note:
-    """An equation as it will be written: how deep in loops and branches, whether its results may differ from lane to lane,
+    """An equation as it will be written: how deep it is in loops and branches, whether its results may differ from lane to lane,
     where they are, and about how many instructions it takes.
     """
 
     depth: int
-    equation: str
+    eqn: Any
     varying: bool
     storage: str
     cost: int
+
+    @property
+    def equation(self) -> str:
+        """The equation in short."""
+        return quoted(self.eqn)
 
     def __str__(self) -> str:
         lanes = "varying" if self.varying else "uniform"

@@ -1,5 +1,6 @@
 """The types of numbers, as JAX names them and as LLVM does."""
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -22,17 +23,20 @@ _KINDS = {
 BYTES = {"double": 8, "float": 4, "i1": 1, "i8": 1, "i16": 2, "i32": 4, "i64": 8}
 
 
+@functools.cache
 def kind_of(dtype: Any) -> str:
     """The LLVM type of a real number."""
     return _KINDS[np.dtype(dtype).name]
 
 
+@functools.cache
 def part(dtype: Any) -> np.dtype:
     """The type of the parts of a complex number; that of a real one."""
     dtype = np.dtype(dtype)
     return np.dtype(f"float{4 * dtype.itemsize}") if dtype.kind == "c" else dtype
 
 
+@functools.cache
 def parts_of(dtype: Any) -> tuple[str, int]:
     """The LLVM type of the parts of a number, and how many it has."""
     return kind_of(part(dtype)), 1 + (np.dtype(dtype).kind == "c")

@@ -38,7 +38,8 @@ def entrywise(
 
 
 def _written_out(context: Context, one: One, args: Sequence[np.ndarray]) -> np.ndarray:
-    shape, operands = context.out.shape, [np.broadcast_to(a, context.out.shape).ravel() for a in args]
+    shape = context.out.shape
+    operands = [(a if a.shape == shape else np.broadcast_to(a, shape)).ravel() for a in args]
     if all(is_number(x) for operand in operands for x in operand):
         values = [np.array(list(operand), dtype) for operand, dtype in zip(operands, context.dtypes, strict=True)]
         numbers = on_numbers(context.eqn, values)

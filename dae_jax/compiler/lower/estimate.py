@@ -14,7 +14,7 @@ from ..thresholds import THRESHOLDS
 from .annotated import Annotated, Note
 from .dtypes import BYTES, parts_of
 from .inlining import Inlining
-from .registry import RULES, quoted, size
+from .registry import RULES, size
 from .uniformity import results
 
 
@@ -69,7 +69,7 @@ class _Estimate:
         return list(map(read, jaxpr.jaxpr.outvars))
 
     def _note(self, eqn: Any, depth: int, varying: bool, storage: str, cost: int) -> None:
-        self.notes.append(Note(depth, quoted(eqn), varying, storage, cost))
+        self.notes.append(Note(depth, eqn, varying, storage, cost))
         self.bytes += sum(v.aval.size * _bytes(v.aval) for v in eqn.outvars if v.aval.size > self.few)
 
     def _plain(

@@ -3,10 +3,10 @@
 from collections.abc import Iterator
 from typing import Any
 
-import jax
 from jax.extend.core import ClosedJaxpr
 
 from ..jaxprs.inline import inlined
+from ..jaxprs.walk import jaxprs_in
 
 
 class Inlining:
@@ -23,5 +23,4 @@ class Inlining:
 
 def inner(eqn: Any) -> Iterator[ClosedJaxpr]:
     """The jaxprs that a loop or a branch runs."""
-    is_jaxpr = lambda x: isinstance(x, ClosedJaxpr)
-    return filter(is_jaxpr, jax.tree.leaves(tuple(eqn.params.values()), is_leaf=is_jaxpr))
+    return (x for x in jaxprs_in(tuple(eqn.params.values())) if isinstance(x, ClosedJaxpr))

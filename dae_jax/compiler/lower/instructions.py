@@ -7,7 +7,6 @@ that holds one number of each lane, or a single number that is the same for all.
 import contextlib
 import dataclasses
 import struct
-from collections import ChainMap
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -46,7 +45,8 @@ class Instructions:
         # The turns of the longest loop over an array.
         self.longest = 0
         self._count = 0
-        self._known: ChainMap[str, Value] = ChainMap()
+        # What has been written, by its text: in the function, and in each scope that is open.
+        self._known: list[dict[str, Value]] = [{}]
         self._scaled: dict[str, tuple[Value, float]] = {}
 
     # Text
@@ -66,17 +66,18 @@ class Instructions:
 
     def pure(self, text: str, kind: str, lanes: bool) -> Value:
         """An instruction whose result its operands decide: written once."""
-        found = self._known.get(text)
-        if found is None:
-            found = self._known[text] = self.write(text, kind, lanes)
+        for known in self._known:
+            if text in known:
+                return known[text]
+        found = self._known[-1][text] = self.write(text, kind, lanes)
         return found
 
     @contextlib.contextmanager
     def scope(self) -> Iterator[None]:
         """Instructions that may not be run: what is written here is not known afterwards."""
-        self._known = self._known.new_child()
+        self._known.append({})
         yield
-        self._known = self._known.parents
+        self._known.pop()
 
     def text(self, x: Any, kind: str, lanes: bool = False) -> str:
         """An operand without its type."""
@@ -149,9 +150,17 @@ class Instructions:
 
     # Instructions
 
+    def _in_lanes(self, xs: Iterable[Any]) -> bool:
+        """Whether any of the operands differs from lane to lane."""
+        if self.width > 1:
+            for x in xs:
+                if isinstance(x, Value) and x.lanes:
+                    return True
+        return False
+
     def op(self, code: str, kind: str, *xs: Any, result: str | None = None) -> Value:
         """An instruction whose operands have one type."""
-        lanes = any(isinstance(x, Value) and x.lanes for x in xs)
+        lanes = self._in_lanes(xs)
         texts = [self.text(x, kind, lanes) for x in xs]
         if code.partition(" ")[0] in ("fadd", "fmul"):
             texts.sort()
@@ -168,7 +177,7 @@ class Instructions:
         return out
 
     def intrinsic(self, name: str, kind: str, *xs: Any) -> Value:
-        lanes = any(isinstance(x, Value) and x.lanes for x in xs)
+        lanes = self._in_lanes(xs)
         vector = self.type(kind, lanes)
         suffix = kind.replace("double", "f64").replace("float", "f32")
         full = f"llvm.{name}.{f'v{self.width}' if lanes else ''}{suffix}"
@@ -184,7 +193,7 @@ class Instructions:
         call = lambda ys: self.pure(
             f"call {kind} {function}({', '.join(self.operand(y, kind) for y in ys)})", kind, False
         )
-        if not any(isinstance(x, Value) and x.lanes for x in xs):
+        if not self._in_lanes(xs):
             return call(xs)
         many = vector_function(name, len(xs)) if kind == "double" else None
         if many is not None:
@@ -233,7 +242,7 @@ class Instructions:
             return Complex(self.select(condition, a, c, kind), self.select(condition, b, d, kind))
         if not isinstance(condition, Value):
             return yes if condition else no
-        lanes = any(isinstance(x, Value) and x.lanes for x in (condition, yes, no))
+        lanes = self._in_lanes((condition, yes, no))
         which = self.operand(condition, "i1", condition.lanes)
         return self.pure(
             f"select {which}, {self.operand(yes, kind, lanes)}, {self.operand(no, kind, lanes)}", kind, lanes

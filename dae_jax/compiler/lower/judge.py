@@ -8,6 +8,7 @@ import jax
 from jax.extend.core import ClosedJaxpr
 
 from ..emit import available
+from ..jaxprs.random_keys import without_keys
 from ..jaxprs.scalar_interpreter import Unsupported
 from ..thresholds import THRESHOLDS
 from . import estimate, rules as rules
@@ -31,16 +32,17 @@ def unsupported(jaxpr: ClosedJaxpr, batched: tuple[bool, ...] = ()) -> tuple[Uns
     judged, inlined = annotate(jaxpr, batched), Inlining()
     if isinstance(judged, Annotated):
         return ()
-    return tuple(_unsupported(inlined(jaxpr), inlined)) or (judged,)
+    return tuple(_unsupported(inlined(without_keys(jaxpr)), inlined)) or (judged,)
 
 
 @functools.lru_cache(maxsize=4)
 def _annotated(jaxpr: ClosedJaxpr, batched: tuple[bool, ...]) -> Annotated | Unsupported:
     inlined = Inlining()
-    found = next(_unsupported(inlined(jaxpr), inlined), None)
+    flat = inlined(without_keys(jaxpr))
+    found = next(_unsupported(flat, inlined), None)
     if found is not None:
         return found
-    annotated = estimate.annotated(inlined(jaxpr), batched, inlined)
+    annotated = estimate.annotated(flat, batched, inlined)
     return _too_large(annotated) or annotated
 
 

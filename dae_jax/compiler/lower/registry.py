@@ -1,6 +1,7 @@
 """The table of primitives that can be compiled: one rule each."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -93,5 +94,9 @@ def quoted(eqn: Any) -> str:
 
 def named(aval: Any) -> str:
     """The name of a type of numbers."""
-    dtype = getattr(aval, "dtype", None)
+    return _name(getattr(aval, "dtype", None))
+
+
+@functools.cache
+def _name(dtype: Any) -> str:
     return np.dtype(dtype).name if isinstance(dtype, np.dtype | type) else str(dtype)
