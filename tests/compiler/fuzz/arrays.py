@@ -78,7 +78,9 @@ def joined(name: str, dtype: str, draw: Draw) -> Operation:
     shape = draw.shape(1)
     axis = draw.below(len(shape))
     count = 1 + draw.below(3)
-    others = [shape if name == "stack" else (*shape[:axis], 1 + draw.below(4), *shape[axis + 1 :]) for _ in range(count)]
+    others = [
+        shape if name == "stack" else (*shape[:axis], 1 + draw.below(4), *shape[axis + 1 :]) for _ in range(count)
+    ]
     operands = tuple(Operand(dtype, s) for s in (shape, *others))
     fn = (lambda *xs: lax.concatenate(xs, axis)) if name == "concatenate" else (lambda *xs: jnp.stack(xs, axis))
     return Operation(name, fn, operands, smooth=dtype in FLOATS)
@@ -104,8 +106,9 @@ def reduction(name: str, dtype: str, draw: Draw) -> Operation:
     domain = {"reduce_sum": "grid", "reduce_prod": "units"}.get(name, "edges")
     x = Operand(dtype, draw.shape(1), "plain" if dtype in COMPLEX and name == "reduce_sum" else domain)
     axes = draw.axes(len(x.shape))
-    how = getattr(lax, f"{name}_p", None)
-    fn = lambda a: how.bind(a, axes=axes, out_sharding=None) if name in ("reduce_sum", "reduce_max", "reduce_min") else how.bind(a, axes=axes)
+    bind = getattr(lax, f"{name}_p").bind
+    more = {"out_sharding": None} if name in ("reduce_sum", "reduce_max", "reduce_min") else {}
+    fn = lambda a: bind(a, axes=axes, **more)
     return Operation(name, fn, (x,), smooth=dtype in FLOATS and name == "reduce_sum")
 
 
@@ -138,13 +141,10 @@ def logarithmic(name: str, dtype: str, draw: Draw) -> Operation:
 
 @recipe("dot_general", _NUMBERS)
 def product(name: str, dtype: str, draw: Draw) -> Operation:
-    b, m, n = (draw.one_of([1, 2, 3]) for _ in range(3))
-    k, l = draw.one_of([0, 1, 3, 8, 26]), draw.one_of([1, 2])
-    a, c = {"b": b, "m": m, "k": k, "l": l}, {"b": b, "n": n, "k": k, "l": l}
-    names_a, names_c = (list(np.array(list(names))[draw.order(len(names))]) for names in ("bmkl", "bnkl"))
-    places = lambda names, which: tuple(names.index(w) for w in which)
-    numbers = tuple((places(names_a, which), places(names_c, which)) for which in ("kl", "b"))
-    operands = (Operand(dtype, tuple(a[i] for i in names_a), "plain"), Operand(dtype, tuple(c[i] for i in names_c), "plain"))
+    sizes = {letter: draw.one_of([1, 2, 3]) for letter in "bijm"} | {"k": draw.one_of([0, 1, 3, 8, 26])}
+    axes = [[letters[k] for k in draw.order(4)] for letters in ("bikm", "bjkm")]
+    numbers = tuple(tuple(tuple(of.index(w) for w in which) for of in axes) for which in ("km", "b"))
+    operands = tuple(Operand(dtype, tuple(sizes[i] for i in of), "plain") for of in axes)
     return Operation(name, lambda x, y: lax.dot_general(x, y, numbers), operands, smooth=dtype in FLOATS)
 
 
@@ -221,11 +221,17 @@ def scattering(name: str, dtype: str, draw: Draw) -> Operation:
     at = _index(draw, n, draw.one_of([(), (1,), (3,), (9,)]))
     how = {"scatter": "set", "scatter-sub": "subtract", "scatter-mul": "multiply"}.get(name, name[8:])
     kept = tuple(m for d, m in enumerate(x.shape) if d != axis)
-    shape = (*kept[:axis], *at.shape, *kept[axis:]) if name != "scatter" else (*kept[:axis], *[1] * len(at.shape), *kept[axis:])
+    shape = (
+        (*kept[:axis], *at.shape, *kept[axis:])
+        if name != "scatter"
+        else (*kept[:axis], *[1] * len(at.shape), *kept[axis:])
+    )
     update, where = x._replace(shape=shape, domain="units" if how == "multiply" else "plain"), (slice(None),) * axis
 
     def one(a: Any, u: Any, i: Any) -> Any:
-        return getattr(a.at[(*where, i)], how)(jnp.broadcast_to(u, a[(*where, jnp.zeros(at.shape, int))].shape), mode=mode)
+        return getattr(a.at[(*where, i)], how)(
+            jnp.broadcast_to(u, a[(*where, jnp.zeros(at.shape, int))].shape), mode=mode
+        )
 
     match draw.below(4):
         case 0:

@@ -37,7 +37,9 @@ class Difference:
 
     def __str__(self) -> str:
         where = "alone" if self.batch is None else f"a batch of {self.batch}"
-        return f"{self.program.name}: result {self.result} of {where} at {self.at}: {self.found!r}, XLA: {self.wanted!r}"
+        return (
+            f"{self.program.name}: result {self.result} of {where} at {self.at}: {self.found!r}, XLA: {self.wanted!r}"
+        )
 
 
 def arguments(program: Program) -> list[np.ndarray]:

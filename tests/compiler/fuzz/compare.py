@@ -1,15 +1,15 @@
 """How near two results must be, and where they may differ.
 
-| what | ours | XLA | compared |
-|---|---|---|---|
-| functions of the C library (sin, exp, pow, ...) | that of the C library | polynomials of its own | to the units in `operations.ULPS` |
-| numbers smaller than the smallest normal one | as the thread has it, LLVM's constants are kept | flushed to 0 by its threads | one may be 0, no function of them |
-| a sum or product of many floats | in pairs, or as the loop has it | in its own order | on numbers where each order gives the same |
-| a·b + c | may be rounded once | may be rounded once | on numbers where that is the same |
-| complex products and quotients | by real arithmetic, Smith's quotient | by real arithmetic | of finite numbers, divisors that are not 0, to 16 units |
-| select_n of a number out of range | the first or the last case | not said | not |
-| what several windows of one `scatter` write to one place | the last | not said | where they write the same |
-| derivatives | the same equations, rounded differently | | to 64 units, and 256 of the largest result |
+| what | where the two may differ | what is compared |
+|---|---|---|
+| functions of the C library (sin, exp, pow, ...) | XLA has polynomials of its own | to the units in `operations.ULPS` |
+| numbers below the smallest normal one | XLA's threads flush them to 0 | one may be 0; no function of them |
+| sums and products of many floats | in pairs, in a loop, in XLA's order | numbers where each order gives the same |
+| a·b + c | rounded once or twice | numbers where that is the same |
+| complex products, quotients | Smith's quotient here | finite ones, divisors not 0, to 16 units |
+| `select_n` of a number out of range | the nearest case here | nothing |
+| windows of one `scatter` that overlap | the last one stays here | such as write the same |
+| derivatives | equal equations, rounded differently | to 64 units, and 256 of the largest result |
 """
 
 from typing import Any
@@ -24,7 +24,12 @@ def difference(found: Any, wanted: Any, ulps: float = 0, scale: float = 0) -> tu
     `ulps` units in the last place off, and `scale` such units of the largest; what is not a number must be so in both.
     """
     found, wanted = np.asarray(found), np.asarray(wanted)
-    assert (found.dtype, found.shape) == (wanted.dtype, wanted.shape), (found.dtype, wanted.dtype, found.shape, wanted.shape)
+    assert (found.dtype, found.shape) == (wanted.dtype, wanted.shape), (
+        found.dtype,
+        wanted.dtype,
+        found.shape,
+        wanted.shape,
+    )
     same = _same(found, wanted, ulps, scale)
     return None if same.all() else tuple(map(int, np.argwhere(~same)[0]))
 

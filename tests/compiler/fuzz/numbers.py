@@ -77,7 +77,9 @@ class Draw:
             part = operand._replace(dtype=f"float{4 * dtype.itemsize}")
             if operand.domain == "units":
                 return self.rng.choice(np.array([1, -1, 1j, -1j], dtype), shape)
-            return (self.numbers(part, batch) + 0j + 1j * np.nan_to_num(self.numbers(part, batch), posinf=7)).astype(dtype)
+            return (self.numbers(part, batch) + 0j + 1j * np.nan_to_num(self.numbers(part, batch), posinf=7)).astype(
+                dtype
+            )
         if dtype.kind == "b":
             return self.rng.integers(0, 2, shape).astype(bool)
         if isinstance(operand.domain, int):
@@ -94,7 +96,20 @@ class Draw:
             special = [0.0, -0.0, np.inf, -np.inf, np.nan, info.max, info.min, info.tiny, 1.0, -1.0, -0.5, 2.5, 300.0]
             return self._mixed(special, self.rng.normal(0, 3, shape).astype(dtype), 0.6)
         info, bits = np.iinfo(dtype), 8 * dtype.itemsize
-        special = [info.min, info.min + 1, info.max, info.max - 1, info.max // 2 + 1, 0, 1, 2, 7, bits - 1, bits, bits + 1]
+        special = [
+            info.min,
+            info.min + 1,
+            info.max,
+            info.max - 1,
+            info.max // 2 + 1,
+            0,
+            1,
+            2,
+            7,
+            bits - 1,
+            bits,
+            bits + 1,
+        ]
         return self._mixed(special, self.rng.integers(0, 100, shape).astype(dtype), 0.6)
 
     def _grid(self, dtype: np.dtype, shape: Any) -> np.ndarray:
@@ -128,5 +143,3 @@ class Draw:
         ordinary = self.rng.integers(low, min(n + 3, info.max) + 1, shape).astype(dtype)
         special = [info.min, info.max, max(info.min, -n), min(n, info.max), min(n - 1, info.max) if n else 0, 0]
         return self._mixed(special, ordinary, 0.3)
-
-

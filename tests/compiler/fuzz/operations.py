@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax._src import ad_util
 
 from .numbers import ALL, BOOL, COMPLEX, FLOATS, INTEGERS, REAL, SIGNED, Draw, Operand
 
@@ -18,7 +19,7 @@ from .numbers import ALL, BOOL, COMPLEX, FLOATS, INTEGERS, REAL, SIGNED, Draw, O
 @dataclasses.dataclass(frozen=True)
 class Operation:
     """`ulps`: how many units in the last place its results may be off, 0: they are the same; `smooth`: it has a derivative
-    in the domain "smooth"; `exact`: eighths give eighths.
+    in the domain "smooth".
     """
 
     name: str
@@ -50,7 +51,9 @@ ULPS = {
 
 @recipe(" ".join(ULPS.keys() - {"atan2", "pow"}), FLOATS)
 def of_library(name: str, dtype: str, draw: Draw) -> Operation:
-    return Operation(name, getattr(lax, name), (Operand(dtype, draw.shape()),), ULPS[name], name not in ("acosh", "digamma"))
+    return Operation(
+        name, getattr(lax, name), (Operand(dtype, draw.shape()),), ULPS[name], name not in ("acosh", "digamma")
+    )
 
 
 @recipe("atan2 nextafter", FLOATS)
@@ -117,8 +120,10 @@ def whole_power(name: str, dtype: str, draw: Draw) -> Operation:
 @recipe("add_any", ALL)
 def of_pair(name: str, dtype: str, draw: Draw) -> Operation:
     of_complex = dtype in COMPLEX and name in ("mul", "div")
-    x = Operand(dtype, draw.shape(), "smooth" if name == "div" and dtype in COMPLEX else "plain" if of_complex else "edges")
-    fn = (lambda a, b: jax._src.ad_util.add_any_p.bind(a, b)) if name == "add_any" else getattr(lax, name)
+    x = Operand(
+        dtype, draw.shape(), "smooth" if name == "div" and dtype in COMPLEX else "plain" if of_complex else "edges"
+    )
+    fn = ad_util.add_any_p.bind if name == "add_any" else getattr(lax, name)
     smooth = dtype in FLOATS and name in ("add", "sub", "mul", "div", "rem")
     return _with_number(Operation(name, fn, (x, x), 16 if of_complex else 0, smooth), draw)
 
@@ -192,8 +197,6 @@ def counting(name: str, dtype: str, draw: Draw) -> Operation:
     axis = draw.below(len(shape))
     x = Operand(dtype, shape, "plain")
     return Operation(name, lambda a: a + lax.broadcasted_iota(dtype, shape, axis), (x,))
-
-
 
 
 @recipe("eq_to le_to lt_to", (*FLOATS, *INTEGERS))

@@ -49,7 +49,9 @@ def _turned(x: Any) -> Any:
 
 def _in_scan(fn: Any, k: Any, xs: Any) -> Any:
     reverse = len(xs) % 2 == 0
-    return lax.scan(lambda c, _: (tuple(map(_turned, c)), fn(*c)), tuple(xs), None, 3, reverse=reverse, unroll=1 + reverse)[1]
+    return lax.scan(
+        lambda c, _: (tuple(map(_turned, c)), fn(*c)), tuple(xs), None, 3, reverse=reverse, unroll=1 + reverse
+    )[1]
 
 
 def _in_while(fn: Any, k: Any, xs: Any) -> Any:
@@ -92,7 +94,11 @@ def _pulled(fn: Any, xs: Any) -> Any:
 
 
 def _inexact(xs: Any, smooth: Any) -> tuple[Any, ...]:
-    return tuple(xs) if all(smooth) else tuple(x if s else np.zeros(x.shape, jax.dtypes.float0) for x, s in zip(xs, smooth, strict=True))
+    return (
+        tuple(xs)
+        if all(smooth)
+        else tuple(x if s else np.zeros(x.shape, jax.dtypes.float0) for x, s in zip(xs, smooth, strict=True))
+    )
 
 
 def single(name: str, dtype: str, seed: int) -> Program:
@@ -193,12 +199,10 @@ class Composition:
 
     def applied(self, pool: list[Any], draw: Draw) -> list[Any]:
         name, dtype = draw.one_of(self.choices)
-        if draw.chance(0.5):  # of a type that is there already
-            dtype = str(draw.one_of(pool).dtype)
-        operation: Operation = RECIPES.get((name, dtype), RECIPES[draw.one_of(self.choices)])(name, dtype, draw) if (
-            name,
-            dtype,
-        ) in RECIPES else RECIPES["select_n", dtype]("select_n", dtype, draw)
+        there = str(draw.one_of(pool).dtype)
+        if draw.chance(0.5) and (name, there) in RECIPES:
+            dtype = there
+        operation: Operation = RECIPES[name, dtype](name, dtype, draw)
         out = jax.tree.leaves(operation.fn(*(self.operand(pool, o, draw) for o in operation.operands)))
         return [_tame(x, operation.ulps or operation.name in INEXACT) for x in out if 0 < x.size < 1000]
 
@@ -213,7 +217,9 @@ class Composition:
             def run(*xs: Any) -> tuple[Any, ...]:
                 found = self.steps([*others, *xs], [*seed, which], 1 + which % 3, depth)
                 again = Draw(*seed, which, 99)
-                pick = lambda x: again.one_of([y for y in found[-4:] if (y.shape, y.dtype) == (x.shape, x.dtype)] or found[-3:])
+                pick = lambda x: again.one_of(
+                    [y for y in found[-4:] if (y.shape, y.dtype) == (x.shape, x.dtype)] or found[-3:]
+                )
                 return tuple(_shaped(_typed(pick(x), x.dtype), x.shape, again) for x in xs)
 
             return run
@@ -251,7 +257,11 @@ INEXACT = frozenset("div rem nextafter sqrt integer_pow reduce_prod cumprod".spl
 def composed(seed: int, copies: bool = False) -> Program:
     """Many operations; with `copies` such as write into memory."""
     draw = Draw(seed, 3)
-    dtypes = ["float64", draw.one_of(["int32", "uint8", "int64"]), draw.one_of(["float32", "bool", "uint32", "complex128"])]
+    dtypes = [
+        "float64",
+        draw.one_of(["int32", "uint8", "int64"]),
+        draw.one_of(["float32", "bool", "uint32", "complex128"]),
+    ]
     size = draw.one_of([(3,), (24,), (25,), (60,), (5, 6)])
     operands = (*(Operand(d, size if i != 1 else (9,), "grid") for i, d in enumerate(dtypes)), Operand("int32", (), 8))
     shared = tuple(draw.chance(0.15) for _ in operands)

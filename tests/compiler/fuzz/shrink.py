@@ -46,7 +46,9 @@ class Failure:
         if at is None:
             return None
         batch = f"a batch of {len(np.asarray(found))}" if any(lanes) else "alone"
-        return dataclasses.replace(self, what=f"{batch}, at {at}: {np.asarray(found)[at]!r}, XLA: {np.asarray(wanted)[at]!r}")
+        return dataclasses.replace(
+            self, what=f"{batch}, at {at}: {np.asarray(found)[at]!r}, XLA: {np.asarray(wanted)[at]!r}"
+        )
 
     def __str__(self) -> str:
         text = str(self.jaxpr).splitlines()
@@ -62,7 +64,14 @@ def shrunk(found: Difference) -> Failure | None:
     args = arguments(program)
     first = [x if s else x[0] for x, s in zip(args, program.shared, strict=True)]
     jaxpr = jax.make_jaxpr(program.fn)(*first)
-    start = Failure(_giving(jaxpr, jaxpr.jaxpr.outvars[found.result]), args, list(program.shared), program.ulps, program.scale, False)
+    start = Failure(
+        _giving(jaxpr, jaxpr.jaxpr.outvars[found.result]),
+        args,
+        list(program.shared),
+        program.ulps,
+        program.scale,
+        False,
+    )
     candidates = [dataclasses.replace(s, copies=c) for c in (False, True) for s in _batches(start, found)]
     now = next(filter(None, (c.run() for c in candidates)), None)
     smaller = now
@@ -77,10 +86,14 @@ def _batches(failure: Failure, found: Difference) -> Iterator[Failure]:
     element = found.at[0] if found.batch is not None else 0
     args, shared = failure.args, failure.shared
     row = lambda x, s: x if s else x[element]
-    yield dataclasses.replace(failure, args=[row(*xs) for xs in zip(args, shared, strict=True)], shared=[True] * len(args))
+    yield dataclasses.replace(
+        failure, args=[row(*xs) for xs in zip(args, shared, strict=True)], shared=[True] * len(args)
+    )
     for n in sorted({1, found.batch or 1}):
         if not all(shared):
-            part = [x if s else x[element : element + 1] if n == 1 else x[:n] for x, s in zip(args, shared, strict=True)]
+            part = [
+                x if s else x[element : element + 1] if n == 1 else x[:n] for x, s in zip(args, shared, strict=True)
+            ]
             yield dataclasses.replace(failure, args=part)
 
 

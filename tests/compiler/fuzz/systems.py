@@ -67,9 +67,16 @@ def mechanism(seed: int) -> Problem:
     for i, parent in enumerate(parents):
         along = draw.rng.normal(size=d)
         at[i] = (at[parent] if parent >= 0 else 0) + draw.rng.uniform(0.5, 1.5) * along / np.linalg.norm(along)
-    args = {"stiffness": draw.rng.uniform(5, 50, n), "drag": draw.rng.uniform(0, 0.5), "mass": draw.rng.uniform(0.5, 2, n)}
+    args = {
+        "stiffness": draw.rng.uniform(5, 50, n),
+        "drag": draw.rng.uniform(0, 0.5),
+        "mass": draw.rng.uniform(0.5, 2, n),
+    }
     args = jax.tree.map(jnp.asarray, args)
-    push, wind = draw.one_of([jnp.sin, jnp.tanh, jnp.cos, lambda t: t**2, lambda t: jnp.where(t > 0.3, t, 0.3)]), draw.chance(0.5)
+    push, wind = (
+        draw.one_of([jnp.sin, jnp.tanh, jnp.cos, lambda t: t**2, lambda t: jnp.where(t > 0.3, t, 0.3)]),
+        draw.chance(0.5),
+    )
 
     def spans(q: Any) -> Any:
         q = q.reshape(n, d)
