@@ -22,7 +22,7 @@ class Thresholds:
 
     Control flow:
     - `written_out`: equations up to which a loop of a known number of turns is written out.
-    - `compaction`: what an exchange of lanes costs, in turns of the loop of all lanes.
+    - `compaction`: what a compaction of lanes costs, in turns of the loop of all lanes.
 
     Size:
     - `instructions`: more take longer to compile than they save.

@@ -169,7 +169,12 @@ def test_many_complex_numbers():
             for f in (jnp.real, jnp.imag)
         ]
 
+    def equal(x, y):
+        z = x + 1j * y
+        return [f(w, w[::-1]) for w in (z, z[:4]) for f in (jnp.equal, jnp.not_equal)]
+
     same(fn, np.random.default_rng(0).uniform(0.5, 0.8, (LANES, 60)), ulps=10_000)
+    same(equal, *np.random.default_rng(0).integers(0, 2, (2, LANES, 60)).astype(float))
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])

@@ -49,7 +49,7 @@ def _index(code: Instructions, i: Value, dtype: np.dtype) -> Value:
     return convert(code, i, dtype, np.dtype("int64"))
 
 
-def places_of(context: Context, x: View, read: Read, numbers: Any, sizes: Any, mode: Any) -> Read:
+def offsets_of(context: Context, x: View, read: Read, numbers: Any, sizes: Any, mode: Any) -> Read:
     """Where in `x` an entry of a gather's result is, and whether it is inside (`None`: in any case)."""
     dropped = {*numbers.collapsed_slice_dims, *numbers.operand_batching_dims}
     kept = [d for d in range(x.ndim) if d not in dropped]

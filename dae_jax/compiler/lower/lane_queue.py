@@ -1,7 +1,7 @@
 """Batches whose lanes take a new element as soon as they are done with one.
 
 The main loop of a function is taken apart from what comes before and after it. A lane that has left the loop waits until
-what the waiting lanes have cost is worth an exchange: what comes after the loop, for them; then the next elements, and
+what the waiting lanes have cost is worth a compaction: what comes after the loop, for them; then the next elements, and
 what comes before the loop. So a lane with many steps does not hold up the others.
 """
 
@@ -55,7 +55,7 @@ class LaneQueue:
     ) -> None:
         self.lowering, self.code, self.memory = lowering, lowering.code, lowering.memory
         self.arguments, self.put, self.size, self.last = arguments, put, size, last
-        # (name, LLVM type, operand at the entry, after an exchange, after a turn) of each phi node.
+        # (name, LLVM type, operand at the entry, after a compaction, after a turn) of each phi node.
         self.phis: list[list[str]] = []
 
     def write(self, jaxpr: ClosedJaxpr, place: int) -> None:
@@ -63,41 +63,41 @@ class LaneQueue:
         code = self.code
         # What is written first is run last.
         self.memory.recycles = False
-        head, exchange, onwards, body, done = (code.name() for _ in range(5))
+        head, compaction, onwards, body, done = (code.name() for _ in range(5))
         row = Value(self._phi(code.type("i64", True), "splat (i64 -1)"), "i64", True)
         idle = Value(self._phi("i64", "0"), "i64")
         self.free = Value(f"%{code.name()}", "i1", True)
         entered = code.block
         code.jump(head)
 
-        # The exchange is written first, since it shows what there is to keep; it comes after the head.
+        # The compaction is written first, since it shows what there is to keep; it comes after the head.
         before, code.lines = code.lines, []
-        code.label(exchange)
+        code.label(compaction)
         with code.scope():
-            p, consts = self._exchange(jaxpr, place, row)
+            p, consts = self._compact(jaxpr, place, row)
             self.phis[1][3] = "0"
-            exchanged = code.block
+            compacted = code.block
             code.jump(head)
-        exchange_lines, code.lines = code.lines, before
+        compaction_lines, code.lines = code.lines, before
 
         code.label(head)
         here = len(code.lines)
         with code.scope():
-            self._turn(p, consts, row, idle, (exchange, onwards, body, done))
+            self._turn(p, consts, row, idle, (compaction, onwards, body, done))
             end = code.block
             code.jump(head)
         code.lines[here:here] = [
-            f"{name} = phi {kind} [ {a}, %{entered} ], [ {b or name}, %{exchanged} ], [ {c or name}, %{end} ]"
+            f"{name} = phi {kind} [ {a}, %{entered} ], [ {b or name}, %{compacted} ], [ {c or name}, %{end} ]"
             for name, kind, a, b, c in self.phis
         ]
-        code.lines += exchange_lines
+        code.lines += compaction_lines
         code.label(done)
         code.mask = None
 
     def _turn(self, p: Any, consts: list[Any], row: Value, idle: Value, blocks: tuple[str, str, str, str]) -> None:
-        """A turn of the lanes whose condition holds, unless an exchange is due or all are done."""
+        """A turn of the lanes whose condition holds, unless a compaction is due or all are done."""
         code, n = self.code, p["cond_nconsts"]
-        exchange, onwards, body, done = blocks
+        compaction, onwards, body, done = blocks
         code.mask = code.op("icmp ult", "i64", row, self.size, result="i1")
         for x in (*consts, *self.carry):
             retain(x, 1)
@@ -107,8 +107,8 @@ class LaneQueue:
         goes_on = code.in_lanes(code.copy(self.memory.entries(goes_on)[()], "i1"))
         going = code.op("and", "i1", code.mask, goes_on)
         code.lines.append(f"{self.free.name} = xor {code.type('i1', True)} {going.name}, splat (i1 true)")
-        now, idled = self._exchange_due(code.mask, going, row, idle)
-        code.branch(now, exchange, onwards)
+        now, idled = self._compaction_due(code.mask, going, row, idle)
+        code.branch(now, compaction, onwards)
         code.label(onwards)
         code.branch(code.any(going), body, done)
         code.label(body)
@@ -119,8 +119,8 @@ class LaneQueue:
         for x in consts:
             retain(x, -1)
 
-    def _exchange_due(self, alive: Value, going: Value, row: Value, idle: Value) -> tuple[Value, Value]:
-        """Whether the waiting lanes have cost what an exchange does, and how many turns they have waited."""
+    def _compaction_due(self, alive: Value, going: Value, row: Value, idle: Value) -> tuple[Value, Value]:
+        """Whether the waiting lanes have cost what a compaction does, and how many turns they have waited."""
         code = self.code
         finished = code.op("and", "i1", alive, self.free)
         bits = code.cast("bitcast", finished, f"i{code.width}", True)
@@ -137,7 +137,7 @@ class LaneQueue:
         self.phis.append([f"%{self.code.name()}", kind, first, "", ""])
         return self.phis[-1][0]
 
-    def _exchange(self, jaxpr: ClosedJaxpr, place: int, row: Value) -> tuple[Any, list[Any]]:
+    def _compact(self, jaxpr: ClosedJaxpr, place: int, row: Value) -> tuple[Any, list[Any]]:
         code, free = self.code, self.free
         following = code.select(free, self._next(), row, "i64")
         self.phis[0][3] = following.name

@@ -7,7 +7,7 @@ from ..arithmetic import applied, compared, convert, power, total
 from ..context import Context
 from ..dtypes import ALL, BOOL, COMPLEX, FLOATS, INTEGERS, NUMBERS, REALS, is_signed, kind_of, part
 from ..entrywise import entrywise
-from ..instructions import Complex, Value
+from ..instructions import Complex, Value, parts
 
 
 def _of_its_type(eqn: Any) -> str | None:
@@ -39,7 +39,17 @@ def add_any(context: Context, a: Any, b: Any, **_: Any) -> Any:
     return total(context.code, context.to, a, b)
 
 
-@entrywise("eq ne lt le gt ge", REALS | BOOL)
+@entrywise("eq ne", ALL)
+def equality(context: Context, a: Any, b: Any, **_: Any) -> Any:
+    """Whether they are equal, or not; of complex numbers in both parts."""
+    code, dtype = context.code, part(context.dtype)
+    if context.dtype.kind != "c":
+        return compared(code, context.name, dtype, a, b)
+    both = [compared(code, context.name, dtype, x, y) for x, y in zip(parts(a), parts(b), strict=True)]
+    return code.op("and" if context.name == "eq" else "or", "i1", *both)
+
+
+@entrywise("lt le gt ge", REALS | BOOL)
 def comparison(context: Context, a: Any, b: Any, **_: Any) -> Any:
     """Whether they compare so."""
     return compared(context.code, context.name, context.dtype, a, b)

@@ -14,7 +14,7 @@ from ..arrays import Fused, View, shared
 from ..blocks import for_each
 from ..context import Context
 from ..dtypes import ALL, BOOL, INTEGERS, NUMBERS, REALS
-from ..indices import indices_of, places_of, window_start
+from ..indices import indices_of, offsets_of, window_start
 from ..instructions import Value
 from ..registry import rule
 
@@ -93,7 +93,7 @@ def _scattered(context: Context, x: Any, indices: Any, update: Any, combine: Com
     out, indices, update = _owned(context, x, indices, update)
     numbers, sizes = windows(out.shape, update.shape, p["dimension_numbers"])
     read = indices_of(context, indices, not isinstance(update, np.ndarray) and update.size > memory.few)
-    place = places_of(context, out, read, numbers, sizes, p["mode"])
+    place = offsets_of(context, out, read, numbers, sizes, p["mode"])
 
     def put(index: list[Any], x: Any) -> None:
         at, inside = place(index)
@@ -120,7 +120,7 @@ def gather(context: Context, x: Any, indices: Any, **p: Any) -> Any:
         return _at_known_places(context, x, as_indices(indices), p, fill)
     looped = out.size > memory.few
     read = indices_of(context, indices, looped)
-    place = places_of(context, x, read, p["dimension_numbers"], p["slice_sizes"], p["mode"])
+    place = offsets_of(context, x, read, p["dimension_numbers"], p["slice_sizes"], p["mode"])
 
     def entry(index: Sequence[Any]) -> Any:
         at, inside = place(index)
