@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 
 import dae_jax
-from dae_jax.driver import program, solve
+from dae_jax import solve
+from dae_jax.driver import program
 
 
 def traced():
@@ -32,9 +33,9 @@ def test_problems_are_let_go(monkeypatch):
     assert max(left[3:]) <= 1.1 * max(left[:3])
 
 
-def test_the_ranks_of_problems_are_forgotten(monkeypatch):
-    monkeypatch.setattr(solve, "_ranks", {})
+def test_the_of_known_rank_of_problems_are_forgotten(monkeypatch):
+    monkeypatch.setattr(solve, "_of_known_rank", {})
     monkeypatch.setattr(solve, "KEPT", 3)
     for k in range(9):
         solve._remember(k, None)
-    assert list(solve._ranks) == [6, 7, 8]
+    assert list(solve._of_known_rank) == [6, 7, 8]
