@@ -20,7 +20,7 @@ from ._compat import dce_jaxpr
 from .check import checked
 from .jaxprs.expansions import expanded
 from .jaxprs.scalar_interpreter import Unsupported
-from .jaxprs.unchecked import without_checks
+from .jaxprs.unchecked import checks_dropped
 from .settings import current
 
 
@@ -94,8 +94,8 @@ def _traced(fn: Callable[..., Any], shapes: Any) -> tuple[ClosedJaxpr, Any]:
     """The jaxpr, and the tree of the results."""
     # A kernel knows of no mesh; JAX would write down for each number that it lies on none.
     with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
-        jaxpr, out = jax.make_jaxpr(without_checks(fn), return_shape=True)(*shapes)
-    return jaxpr, jax.tree.structure(out)
+        jaxpr, out = jax.make_jaxpr(fn, return_shape=True)(*shapes)
+        return checks_dropped(jaxpr), jax.tree.structure(out)
 
 
 def called(jaxpr: ClosedJaxpr, args: Sequence[Any]) -> list[Any] | None:

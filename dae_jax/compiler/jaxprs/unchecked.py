@@ -7,7 +7,7 @@ import jax
 from jax.extend.core import ClosedJaxpr, Jaxpr
 
 from .._compat import is_check
-from .walk import equations_in
+from .walk import equations, equations_in
 
 
 def without_checks(fn: Callable[..., Any]) -> Callable[..., Any]:
@@ -19,6 +19,13 @@ def without_checks(fn: Callable[..., Any]) -> Callable[..., Any]:
         return jax.tree.unflatten(jax.tree.structure(out), results)
 
     return unchecked
+
+
+def checks_dropped(closed: ClosedJaxpr) -> ClosedJaxpr:
+    """The same for a function that is traced; itself where it has none, since tracing again takes time."""
+    if not any(map(is_check, equations(closed))):
+        return closed
+    return jax.make_jaxpr(lambda *xs: _evaluate(closed.jaxpr, closed.consts, xs))(*closed.in_avals)
 
 
 def _evaluate(jaxpr: Jaxpr, consts: Any, args: Any) -> list[Any]:
