@@ -5,12 +5,12 @@ import re
 from typing import Any
 
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from ._compat import CALLBACK_LOG, messages, unvmap_any
 from .solution import RESULTS, DAESolution
 
 
@@ -40,7 +40,7 @@ def _sentence(code: Any, end: Any, t0: Any, t1: Any, steps: Any) -> str | None:
     if not failed.size:
         return None
     at = lambda x: np.broadcast_to(x, np.shape(code)).reshape(-1)[failed[0]]
-    said = RESULTS._index_to_message[int(at(code))]
+    said = messages(RESULTS)[int(at(code))]
     if int(at(code)) not in _AT_START:
         said += f" The solve from t = {at(t0):.6g} to {at(t1):.6g} ended at t = {at(end):.6g} after {at(steps)} steps."
     if np.asarray(t0).dtype == np.float32:
@@ -68,7 +68,7 @@ def raised_in_the_program(sol: DAESolution) -> DAESolution:
 def _passed(arrays: Any, failed: Any, details: Any) -> Any:
     shapes = jax.eval_shape(lambda: arrays)
     fail = lambda: jax.pure_callback(_raise, shapes, *details, vmap_method="expand_dims")
-    return lax.cond(eqxi.unvmap_any(failed), fail, lambda: arrays)
+    return lax.cond(unvmap_any(failed), fail, lambda: arrays)
 
 
 @_passed.def_jvp
@@ -78,7 +78,7 @@ def _(primals: Any, tangents: Any) -> Any:
 
 def _raise(*details: Any) -> Any:
     # JAX would print the traceback of this function before the error that has it.
-    logging.getLogger("jax._src.callback").addFilter(_without_ours)
+    logging.getLogger(CALLBACK_LOG).addFilter(_without_ours)
     raise SolveFailed(_sentence(*map(np.asarray, details)))
 
 

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +13,7 @@ import optimistix
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from ._compat import while_loop
 from .checks import saved_parts
 from .initialise import consistent_state
 from .solution import RESULTS, DAESolution, precision_of
@@ -196,7 +196,7 @@ def solve_with_jumps(
     )  # fmt: skip
     kind: Any = "checkpointed" if solve.derivative() == "reverse" else "lax"
     most = {"max_steps": jump.most + 1} if kind == "checkpointed" else {}
-    p = eqxi.while_loop(lambda p: p.code == going, advance, start, kind=kind, **most)
+    p = while_loop(lambda p: p.code == going, advance, start, kind=kind, **most)
     stats = {"max_steps": solve.max_steps, **p.stats, "end_time": p.t, "jumps": p.count, "jump_times": p.times}
     result = eqx.tree_at(lambda r: r._value, RESULTS.successful, p.code)
     precision = precision_of(t0.dtype, solve.controller)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix
 
+from ._compat import trace_state_is_clean
 from .checks import is_saved_part, saved_parts
 from .compiler import PullBack, inexact, one_kernel, one_kernel_enabled, waiting
 from .formulations import AbstractFormulation, Residual
@@ -80,8 +81,21 @@ class _Split(eqx.Module):
         return eqx.combine(self.numbers, self.rest)
 
 
+# How many problems stay compiled. Each holds 8 MB and more, most of it in JAX's caches of what it has traced.
+KEPT = 32
+_traced: list[Program] = []
+
+
+def _make_room() -> None:
+    """JAX and equinox keep the traces of thousands of problems: after so many new ones they are told to forget them."""
+    if len(_traced) >= KEPT and trace_state_is_clean():
+        _traced.clear()
+        jax.clear_caches()
+
+
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def _jitted(program: Program, rank: int | Rank | None, arrays: list[Any]) -> Any:
+    _traced.append(program)
     solve, *inputs = program.inputs(jax.tree.map(jnp.asarray, arrays))
     waiting.begin(always=not isinstance(solve.progress_meter, diffrax.NoProgressMeter))
     solve.refuse_wrong_functions(*inputs)
@@ -100,6 +114,7 @@ def _numbers(program: Program, rank: int | Rank | None, arrays: list[Any]) -> _S
 
 def run(program: Program, rank: int | Rank | None, arrays: list[Any]) -> tuple[DAESolution, Any, float]:
     """The solution, whether the start was consistent and of the given rank, and the seconds spent on compiling this."""
+    _make_room()
     try:
         sol, as_expected = _jitted(program, rank, arrays)
     finally:

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Real
 
+from ._compat import messages
+
 
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     """diffrax's result codes, and those of a DAE."""
@@ -83,7 +85,7 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
 
 
 # A success says so where it is printed.
-RESULTS._index_to_message[int(RESULTS.successful._value)] = "successful"
+messages(RESULTS)[int(RESULTS.successful._value)] = "successful"
 
 
 class Interpolation(eqx.Module):

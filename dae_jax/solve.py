@@ -20,7 +20,7 @@ from .formulations import (
 )
 from .jumps import Jump, refuse_other_outputs
 from .normals import Rank
-from .program import Program, Solve, run, split
+from .program import KEPT, Program, Solve, run, split
 from .solution import DAESolution
 from .solve_options import refuse_misfits, refuse_no_event, refuse_other_steps, refuse_wrong_options, takes_residuals
 from .solvers import SelectedResiduals, SelectedStates
@@ -166,13 +166,20 @@ def _run_on_numbers(program: Program, arrays: list[Any], inputs: Any) -> DAESolu
     inside = isinstance(as_expected, jax.core.Tracer)
     if inside or not as_expected:
         with jax.ensure_compile_time_eval():
-            _ranks[program] = refuse_bad_start(system, t0, y0, args, solve.formulation.inverts_mass)
-        if _ranks[program] != rank:
-            sol, _, more = run(program, _ranks[program], arrays)
+            found = refuse_bad_start(system, t0, y0, args, solve.formulation.inverts_mass)
+        _remember(program, found)
+        if found != rank:
+            sol, _, more = run(program, found, arrays)
             seconds += more
     if not inside:
         sol.stats["compile_seconds"] = seconds
     return sol
+
+
+def _remember(program: Program, rank: Rank | None) -> None:
+    _ranks[program] = rank
+    for oldest in list(_ranks)[:-KEPT]:
+        _ranks.pop(oldest, None)
 
 
 def _default_controller(dt0: Any, dtype: Any) -> Any:

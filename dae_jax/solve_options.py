@@ -9,8 +9,8 @@ import equinox as eqx
 import jax
 import numpy as np
 import optimistix
-from diffrax._root_finder import use_stepsize_tol
 
+from ._compat import use_stepsize_tol
 from .formulations import AbstractFormulation, Baumgarte, Differentiation, DummyDerivatives, Residual, StateSpace
 from .jumps import Jump
 from .solvers import (

@@ -20,6 +20,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import PyTree
 
+from .compiler import processors
 from .failures import sentence_of
 from .progress import Progress
 from .solution import RESULTS
@@ -167,7 +168,7 @@ def _run(call: Any, elements: Any, chunk: int, kept: Any, devices: list[Any], re
     """All chunks of this process that are not done, several at once: what is no kernel of ours may take one core only."""
     size = jax.tree.leaves(elements)[0].shape[0]
     mine = [c for c in np.flatnonzero(~kept.done) if c % jax.process_count() == jax.process_index()]
-    workers = max(len(os.sched_getaffinity(0)) // len(devices), 1) if devices[0].platform == "cpu" else 2
+    workers = max(processors() // len(devices), 1) if devices[0].platform == "cpu" else 2
 
     def work(c: int) -> tuple[int, list[np.ndarray]]:
         # The last chunk is filled with its last element, so that one compiled function serves all.

@@ -11,7 +11,7 @@ import pytest
 
 PACKAGE = Path(__file__).parent.parent / "dae_jax"
 LAYERS = (
-    {"compiler", "interrupts", "linalg", "progress", "structure"},
+    {"_compat", "compiler", "interrupts", "linalg", "progress", "structure"},
     {
         "constraints",
         "initialise",

@@ -14,5 +14,9 @@ from .one_kernel import (
     inexact as inexact,
     one_kernel as one_kernel,
 )
-from .settings import configure as configure, one_kernel_enabled as one_kernel_enabled
+from .settings import (
+    configure as configure,
+    one_kernel_enabled as one_kernel_enabled,
+    processors as processors,
+)
 from .subroutine import subroutine as subroutine

@@ -46,6 +46,13 @@ def one_kernel_enabled() -> bool:
     return current().compiler != "off"
 
 
+def processors() -> int:
+    """How many threads may compute at a time: those of the settings, and no more than the process has processors for."""
+    current()
+    own = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(own, THREADS.value)
+
+
 @functools.cache
 def _from_environment() -> Settings:
     settings, threads = read(os.environ)

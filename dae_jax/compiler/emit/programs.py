@@ -20,8 +20,9 @@ from .runtime import HANDLE, SHARE, STUBS, stubs, text as shared
 from .target import Target, host, llvm
 
 
-# Bytes of object code that are loaded at a time, of all programs; a solve takes 20 to 300 kB.
+# Bytes that loaded programs take at a time: a solve has 20 to 300 kB of object code, and each an execution engine beside it.
 BOUND = 64 * 2**20
+ENGINE = 150_000
 
 _lock = threading.RLock()
 # A child process finds the lock free.
@@ -164,21 +165,21 @@ def _load(program: _Program, code: bytes) -> None:
     shared.clock.value += 1
     shared.fill(program.slot, program.engine.get_function_address(f"{program.name}.kernel"))
     loaded = [p for p in _programs.values() if p.engine is not None and p is not program]
-    total = program.size + sum(p.size for p in loaded)
+    total = sum(p.size + ENGINE for p in (program, *loaded))
     for old in sorted(loaded, key=lambda p: p.last_use):
         if total <= BOUND:
             return
         if old.place is not None and shared.release(old.slot):
             old.engine.close()
             old.engine = None
-            total -= old.size
+            total -= old.size + ENGINE
 
 
 def _load_again(slot: int) -> int:
     """Called by the handler of a program whose code was let go; 0 where it cannot be loaded."""
     with _lock:
         program = next((p for p in _programs.values() if p.slot == slot), None)
-        if program is None:
+        if program is None or program.place is None:
             return 0
         if program.engine is None:
             file, start = program.place

@@ -8,6 +8,7 @@ import jax
 from jax.extend.core import ClosedJaxpr
 
 from ..emit import register
+from ..emit.target import Target, host
 from ..jaxprs.scalar_interpreter import Unsupported
 from .judge import annotate, unsupported
 from .module_text import module_text
@@ -18,9 +19,13 @@ def hindrances(jaxpr: ClosedJaxpr) -> tuple[str, ...]:
     return tuple(dict.fromkeys(found.primitive for found in unsupported(jaxpr)))
 
 
-@functools.lru_cache(maxsize=2)
 def written(jaxpr: ClosedJaxpr, batched: tuple[bool, ...] = (), always_copies: bool = False) -> str:
     """The module of a function; as `module_text` makes it. Errors: `Unsupported`, with what `annotate` finds."""
+    return _written(jaxpr, batched, always_copies, host())
+
+
+@functools.lru_cache(maxsize=2)
+def _written(jaxpr: ClosedJaxpr, batched: tuple[bool, ...], always_copies: bool, _: Target) -> str:
     annotated = annotate(jaxpr, batched)
     if isinstance(annotated, Unsupported):
         raise annotated

@@ -1,0 +1,24 @@
+"""All of JAX, diffrax and equinox that the package leans on without being promised it; `compiler/_compat.py` has the compiler's.
+
+The value of a `RESULTS` is read as `result._value` where it is needed: a number, or a tracer of one.
+"""
+
+from typing import Any
+
+from diffrax._root_finder import use_stepsize_tol as use_stepsize_tol
+from equinox.internal import unvmap_any as unvmap_any, while_loop as while_loop
+from jax._src.core import trace_state_clean
+
+
+# Whose log has the traceback of an error that a callback raised, before JAX raises its own.
+CALLBACK_LOG = "jax._src.callback"
+
+
+def trace_state_is_clean() -> bool:
+    """Whether nothing is being traced in this thread."""
+    return trace_state_clean()
+
+
+def messages(enumeration: Any) -> list[str]:
+    """The messages of an equinox enumeration by number; what is written here is said."""
+    return enumeration._index_to_message

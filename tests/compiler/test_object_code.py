@@ -1,0 +1,149 @@
+"""Object code that is kept: in memory within a bound, on disk where nobody else can write."""
+
+import ctypes
+import os
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import numpy as np
+import pytest
+
+from dae_jax.compiler import one_kernel
+from dae_jax.compiler.emit import object_cache, object_code, programs, register, target
+from dae_jax.compiler.lower.module import written
+from dae_jax.compiler.settings import configure
+from tests.compiler.samples import X, numbered
+
+
+class TestLeastRecentlyUsed:
+    def test_code_is_let_go_and_comes_back(self, monkeypatch):
+        calls = []
+        for k in range(6):
+            fn, _ = numbered(100.0 + k)
+            call = jax.jit(one_kernel(fn, "forward")).lower(X).compile()
+            calls.append((call, np.asarray(fn(X))))
+        own = list(programs._programs.values())[-6:]
+        monkeypatch.setattr(programs, "BOUND", 2 * (own[0].size + programs.ENGINE))
+        for call, expected in calls * 3:
+            np.testing.assert_allclose(call(X), expected, rtol=1e-14)
+            jax.jit(one_kernel(numbered(time.monotonic())[0], "forward"))(X)
+            loaded = [p for p in programs._programs.values() if p.engine is not None]
+            assert sum(p.size + programs.ENGINE for p in loaded) <= programs.BOUND or len(loaded) == 1
+
+    def test_the_last_used_stay(self, monkeypatch):
+        calls = [jax.jit(one_kernel(numbered(200.0 + k)[0], "forward")).lower(X).compile() for k in range(3)]
+        own = list(programs._programs.values())[-3:]
+        jax.jit(one_kernel(numbered(210.0)[0], "forward"))(X)
+        jax.block_until_ready(calls[0](X))
+        monkeypatch.setattr(programs, "BOUND", int(3.5 * (own[0].size + programs.ENGINE)))
+        jax.jit(one_kernel(numbered(211.0)[0], "forward"))(X)
+        assert own[0].engine is not None
+        assert own[1].engine is None
+        assert own[2].engine is None
+
+    def test_what_is_running_is_kept(self):
+        """A call that is counted keeps the code, whoever wants it gone."""
+        name = register(written(jax.make_jaxpr(lambda x: x * 17)(X)))
+        program = programs._programs[name]
+        running = ctypes.c_int64.from_address(program.slot + 8)
+        running.value += 1
+        assert not programs.runtime().release(program.slot)
+        running.value -= 1
+        assert programs.runtime().release(program.slot)
+        programs.runtime().fill(program.slot, program.engine.get_function_address(f"{name}.kernel"))
+
+    def test_threads_that_call_what_others_let_go(self, monkeypatch):
+        monkeypatch.setattr(programs, "BOUND", 1)
+        calls = []
+        for k in range(8):
+            fn, _ = numbered(300.0 + k)
+            calls.append((jax.jit(one_kernel(fn, "forward")).lower(X).compile(), np.asarray(fn(X))))
+
+        def work(k):
+            for _ in range(40):
+                np.testing.assert_allclose(calls[k][0](X), calls[k][1], rtol=1e-14)
+
+        with ThreadPoolExecutor(8) as pool:
+            list(pool.map(work, range(8)))
+
+
+@pytest.fixture
+def cache(tmp_path):
+    before = jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    yield tmp_path / "dae_jax"
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+class TestObjectCodeOnDisk:
+    TEXT = "define i64 @f() {\nret i64 7\n}"
+
+    def test_it_is_kept_and_taken(self, cache, monkeypatch):
+        code = programs.compiled(self.TEXT, target.host())
+        (file,) = cache.iterdir()
+        assert file.stat().st_mode & 0o777 == 0o600
+        assert cache.stat().st_mode & 0o777 == 0o700
+        monkeypatch.setattr(programs, "object_code", lambda *_: pytest.fail("compiled again"))
+        assert programs.compiled(self.TEXT, target.host()) == code
+
+    @pytest.mark.parametrize(
+        "harm", [lambda b: b[:-1], lambda b: b[:99] + b"x" + b[100:], lambda b: b"", lambda b: b[20:]]
+    )
+    def test_a_damaged_file_is_compiled_again(self, cache, harm):
+        code = programs.compiled(self.TEXT, target.host())
+        (file,) = cache.iterdir()
+        whole = file.read_bytes()
+        file.write_bytes(harm(whole))
+        assert programs.compiled(self.TEXT, target.host()) == code
+        assert file.read_bytes() == whole
+
+    @pytest.mark.parametrize("mode", [0o777, 0o770, 0o720])
+    def test_a_folder_that_others_can_write_to_is_not_used(self, cache, mode):
+        programs.compiled(self.TEXT, target.host())
+        (file,) = cache.iterdir()
+        cache.chmod(mode)
+        assert object_cache.load(file.stem) is None
+        cache.chmod(0o700)
+        assert object_cache.load(file.stem)
+        file.chmod(0o666)
+        assert object_cache.load(file.stem) is None
+
+    def test_links_are_not_followed(self, cache, tmp_path):
+        programs.compiled(self.TEXT, target.host())
+        (file,) = cache.iterdir()
+        moved = file.rename(tmp_path / "moved.o")
+        file.symlink_to(moved)
+        assert object_cache.load(file.stem) is None
+        file.unlink()
+        moved.rename(file)
+        folder = cache.rename(tmp_path / "elsewhere")
+        cache.symlink_to(folder)
+        assert object_cache.load(file.stem) is None
+
+    def test_what_the_key_depends_on(self, monkeypatch):
+        def key(text="text", passes=True):
+            return object_code.key(text, target.host(), passes)
+
+        first = key()
+        assert key("other") != first
+        assert key(passes=False) != first
+        for owner, name, value in (
+            (object_code, "SPEED", 3), (object_code, "BY_VECTORS", (True, True)), (object_code, "HEAVY", 1),
+            (object_code, "VERSION", (0, 4)), (object_code.importlib.metadata, "version", lambda _: "9.9"),
+        ):  # fmt: skip
+            with monkeypatch.context() as patch:
+                patch.setattr(owner, name, value)
+                assert key() != first, name
+        with configure(isa="sse2"):
+            assert key() != first
+
+    def test_there_is_a_bound(self, cache, monkeypatch):
+        monkeypatch.setattr(object_cache, "BOUND", 2500)
+        for k in range(5):
+            object_cache.keep(f"key{k}", bytes(1000))
+            os.utime(cache / f"key{k}.o", (k, k))
+        assert sorted(f.name for f in cache.iterdir()) == ["key3.o", "key4.o"]
+
+    def test_no_cache_no_file(self, tmp_path):
+        assert object_cache._folder() is None
