@@ -8,6 +8,7 @@ import jax
 from jax.extend.core import ClosedJaxpr
 
 from ..emit import available
+from ..emit.target import Target, host
 from ..jaxprs.random_keys import without_keys
 from ..jaxprs.scalar_interpreter import Unsupported
 from ..thresholds import THRESHOLDS
@@ -24,7 +25,7 @@ def annotate(jaxpr: ClosedJaxpr, batched: tuple[bool, ...] = ()) -> Annotated | 
     """The function as it will be compiled, or why it cannot be; `batched`: which arguments have a leading axis of lanes."""
     if not available():
         return Unsupported("no machine code is made for this operating system", primitive="system")
-    return _annotated(jaxpr, batched)
+    return _annotated(jaxpr, batched, host())
 
 
 def unsupported(jaxpr: ClosedJaxpr, batched: tuple[bool, ...] = ()) -> tuple[Unsupported, ...]:
@@ -36,7 +37,7 @@ def unsupported(jaxpr: ClosedJaxpr, batched: tuple[bool, ...] = ()) -> tuple[Uns
 
 
 @functools.lru_cache(maxsize=4)
-def _annotated(jaxpr: ClosedJaxpr, batched: tuple[bool, ...]) -> Annotated | Unsupported:
+def _annotated(jaxpr: ClosedJaxpr, batched: tuple[bool, ...], _: Target) -> Annotated | Unsupported:
     inlined = Inlining()
     flat = inlined(without_keys(jaxpr))
     found = next(_unsupported(flat, inlined), None)
