@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import dae_jax
-from dae_jax.scenes import charge_pump, elastic_crank
+from dae_jax.scenes import charge_pump, elastic_crank, wheelset
 
 
 PUMP = charge_pump()
@@ -53,3 +53,12 @@ def test_the_elastic_crank_starts_as_published():
     y = jnp.asarray(scene.y0)
     rates = jnp.concatenate([y[7:21], jnp.zeros(10)])
     np.testing.assert_allclose(scene.system.residual(0.0, y, rates, None), 0, atol=1e-6)
+
+
+def test_the_wheelset_starts_as_published():
+    """The published accelerations satisfy the equations to round-off."""
+    scene = wheelset()
+    rates = np.zeros(17)
+    rates[5:8] = -1.975258894011285, -1.0898297102811276e-3, 7.8855083626142589e-2
+    rates[8:11] = -5.533362821731549, -0.3487021489546511, -2.132968724380927
+    np.testing.assert_allclose(scene.system.residual(0.0, jnp.asarray(scene.y0), rates, None), 0, atol=1e-13)

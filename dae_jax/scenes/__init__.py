@@ -18,6 +18,7 @@ from .pendulum import (
 from .scene import Drawing as Drawing, Scene as Scene
 from .stiff_mechanisms import andrews as andrews, car_axis as car_axis
 from .surfaces import bead_on_torus as bead_on_torus, knife_edge as knife_edge
+from .wheelset import wheelset as wheelset
 
 
 SCENES: dict[str, Callable[[], Scene]] = {

@@ -1,5 +1,7 @@
 """A transistor between two capacitors on a pulsed voltage: nanoseconds and picocoulombs, kinks in time and in the charges."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -67,7 +69,7 @@ def _state(voltage: float, current: float) -> np.ndarray:
     def charges(moved):
         return _charges(np, voltage, voltage - moved / SOURCE, voltage - moved / DRAIN)
 
-    moved = brentq(lambda x: x + charges(x)[1], 0.0, GATE * HIGH, xtol=1e-28, rtol=1e-14)
+    moved: Any = brentq(lambda x: x + charges(x)[1], 0.0, GATE * HIGH, xtol=1e-28, rtol=1e-14)
     gate, channel = charges(moved)
     return np.array([gate, moved, channel, moved, channel, voltage, moved / SOURCE, moved / DRAIN, current])
 

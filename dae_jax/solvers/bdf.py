@@ -125,6 +125,8 @@ class BDF(AbstractResidualSolver):
 
     **Arguments**
 
+    - `dense`: whether values between steps are wanted (`daesolve` sets it as `saveat` and `event` need it): then the user's
+      variables of index 2 and higher are in the error test too.
     - `rtol`, `atol`: by default those of the step-size controller, which must not differ.
 
     The step size follows from the order, so it is the solver that finds it, and the error it returns is the one from
