@@ -1,6 +1,7 @@
 """Sources that jump: solvers of residuals pass, with the algebraic variables; those that differentiate the jump say so."""
 
 import diffrax
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -78,9 +79,9 @@ def test_jumps_that_are_announced_are_stepped_to(solver):
     assert steps < 0.6 * unannounced
 
 
-@pytest.mark.parametrize("tolerance", [1e-4, 1e-8])
+@pytest.mark.parametrize("announced", [True, False], ids=["announced", "found"])
 @pytest.mark.parametrize("solver", [dae_jax.RadauIIA5(), dae_jax.BDF()], ids=["radau", "bdf"])
-def test_a_voltage_jumps_from_one_side_of_a_diode_to_the_other(solver, tolerance):
+def test_a_voltage_jumps_from_one_side_of_a_diode_to_the_other(solver, announced):
     """A buck converter: the coil's current leaves the switch for the diode, where a whole Newton correction overflows."""
     coil, capacitor, load, supply, on, off, period = 1e-3, 1e-4, 10.0, 24.0, 0.01, 1e6, 1e-4
 
@@ -99,9 +100,16 @@ def test_a_voltage_jumps_from_one_side_of_a_diode_to_the_other(solver, tolerance
     system = dae_jax.ImplicitDAE(residual)
     start = dae_jax.consistent_state(system, 0.0, jnp.array([0, 0, supply]), fixed=jnp.array([True, True, False]))
     switched = jnp.array([0.4, 1.0, 1.4, 2.0, 2.4]) * period
-    control = diffrax.ClipStepSizeController(diffrax.PIDController(rtol=tolerance, atol=tolerance), jump_ts=switched)
-    sol = dae_jax.daesolve(system, solver, 0.0, 2.7 * period, None, start, stepsize_controller=control, max_steps=20_000)
-    current, voltage, node = sol.ys[-1]
+
+    @jax.jit
+    def solve(tolerance):
+        control = diffrax.PIDController(rtol=tolerance, atol=tolerance)
+        control = diffrax.ClipStepSizeController(control, jump_ts=switched) if announced else control
+        sol = dae_jax.daesolve(
+            system, solver, 0.0, 2.7 * period, None, start, stepsize_controller=control, max_steps=20_000
+        )
+        return sol.ys[-1]
+
     # The same with the node eliminated by hand, by the midpoint rule with steps of 10 ns.
     y = np.zeros(2)
     n = 27_000
@@ -111,5 +119,8 @@ def test_a_voltage_jumps_from_one_side_of_a_diode_to_the_other(solver, tolerance
         driven = lambda y, conducting=conducting: supply - on * y[0] if conducting else -0.05 * np.log1p(y[0] / 1e-9)
         slope = lambda y, driven=driven: np.array([(driven(y) - y[1]) / coil, (y[0] - y[1] / load) / capacitor])
         y = y + h * slope(y + h / 2 * slope(y))
-    np.testing.assert_allclose([current, voltage], y, atol=30 * tolerance + 2e-6)
-    assert -1.2 < node < -0.9
+    # At 1e-4 a step may pass from one period to the next without a look at the pulse between, where none is announced.
+    for tolerance in (1e-4, 1e-5, 1e-8)[not announced :]:
+        current, voltage, node = solve(tolerance)
+        np.testing.assert_allclose([current, voltage], y, atol=(30 if announced else 50) * tolerance + 2e-6)
+        assert -1.2 < node < -0.9

@@ -124,6 +124,8 @@ def test_a_diode_switches(solver):
     assert abs(float(sol.ys[0][-1, 0]) - tight.y[0, -1]) < 1e-7
     at = np.asarray(sol.stats["jump_times"][:5])
     np.testing.assert_allclose(tight.sol(at)[0], np.sin(2 * at), atol=1e-7)
+    went_on = solve(dae_jax.Jump(condition, lambda t, y, args: (y, args), direction=direction))
+    assert went_on.result not in (dae_jax.RESULTS.successful, dae_jax.RESULTS.event_occurred)
 
 
 @pytest.mark.parametrize("finder", [optimistix.Newton(1e-10, 1e-10), optimistix.Bisection(1e-10, 1e-10)])
@@ -187,8 +189,14 @@ def test_a_condition_that_is_no_number_is_an_error(direction):
     solve = lambda event: dae_jax.daesolve(BALL, diffrax.Tsit5(), 0.0, 1.0, None, RELEASED, event=event, throw=False)
     ended = solve(diffrax.Event(condition, direction=direction))
     assert ended.result == dae_jax.RESULTS.undefined_condition
-    went_on = solve(dae_jax.Jump(condition, lambda t, y, args: (y, args), direction=direction))
-    assert went_on.result not in (dae_jax.RESULTS.successful, dae_jax.RESULTS.event_occurred)
+
+
+def test_a_condition_that_is_no_number_within_a_step_is_said_to_be_so():
+    """Where a root finder looks, not only where the solve ends."""
+    system = dae_jax.ImplicitDAE(lambda t, y, yd, args: yd + y)
+    event = diffrax.Event(lambda t, y, args, **kwargs: jnp.where(abs(t - 0.5) < 0.05, jnp.nan, t - 0.5), optimistix.Newton(1e-8, 1e-8))
+    ended = dae_jax.daesolve(system, diffrax.Tsit5(), 0.0, 1.0, 0.2, np.ones(1), event=event, throw=False)
+    assert ended.result == dae_jax.RESULTS.undefined_condition
 
 
 def test_a_state_that_is_no_number_is_no_event():

@@ -100,6 +100,17 @@ def test_a_comparison_has_no_drift_of_a_constraint_that_there_is_not():
     assert row.velocity_drift > 0
 
 
+def test_a_comparison_has_the_drift_of_equations_and_of_hidden_ones():
+    """Of a system that is no mechanism; without hidden equations there is one number."""
+    for name, hidden in (("capacitor-loop", True), ("robertson", False)):
+        scene = SCENES[name]()
+        method = "radau" if name == "robertson" else "differentiation"
+        row, sol = measure(scene, method, methods(scene)[method], np.linspace(0, 0.1, 3), 1e-8)
+        levels = dae_jax.drift(scene.system, sol).levels
+        assert row.position_drift == float(levels[0].max())
+        assert np.isnan(row.velocity_drift) if not hidden else row.velocity_drift == float(levels[1].max())
+
+
 def test_a_system_with_both_kinds_of_constraints_has_both_drawn():
     levels = figures._levels(
         dae_jax.ConstrainedSystem(lambda t, q, v, a: q, lambda t, q, a: q[0], nonholonomic=lambda t, q, v, a: v[1])

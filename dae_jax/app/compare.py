@@ -130,12 +130,12 @@ def measure(scene: Scene, name: str, method: Method, times: np.ndarray, rtol: fl
     median = float(np.median(seconds[1:]))
     row = Row(name, int(sol.stats["num_steps"]), median, seconds[0] - median, scene.error(times, sol.ys))
     system = scene.system
+    equations, *hidden = (float(level.max()) for level in drift(system, sol).levels)
+    row = dataclasses.replace(row, position_drift=equations, velocity_drift=max(hidden, default=np.nan))
     if not is_mechanism(system):
         return row, sol
-    off = drift(system, sol)
-    row = dataclasses.replace(row, velocity_drift=float(off.velocity.max()))
-    if system.constraint is not None:
-        row = dataclasses.replace(row, position_drift=float(off.position.max()))
+    if system.constraint is None:
+        row = dataclasses.replace(row, position_drift=np.nan)
     if system.potential is not None:
         total = np.asarray(energy(system, sol))
         row = dataclasses.replace(row, energy_drift=float(np.abs(total - total[0]).max()))

@@ -27,6 +27,10 @@ def judged(solve: Any, out: Any, problem: Problem, found: Any) -> DAESolution:
     precision = precision_of(fields[0].dtype, solve.controller)
     went_well = (code == RESULTS.successful) | (code == RESULTS.event_occurred)
     code = RESULTS.where(went_well & ~jnp.all(jnp.stack([finite_end, *finite])), RESULTS.not_finite, code)
+    # A root finder that met a condition that is not a number ends anywhere, also at a time that is none.
+    lost = ~defined | ~jnp.isfinite(fields[5]["end_time"])
+    for name in ("nonlinear_max_steps_reached", "nonfinite_input", "nonfinite"):
+        code = failed(getattr(RESULTS, name), RESULTS.undefined_condition, lost)
     went_well = (code == RESULTS.successful) | (code == RESULTS.event_occurred)
     code = RESULTS.where(went_well & ~defined, RESULTS.undefined_condition, code)
     stuck = [RESULTS.step_rejected, RESULTS.off_manifold, RESULTS.no_convergence, RESULTS.error_too_large]

@@ -49,6 +49,11 @@ class ReducedForm(eqx.Module):
         return np.isin(np.arange(self.size), self.ode.orders.places[0][: self.ode.form.layout.size])
 
     @property
+    def independent(self) -> Bool[np.ndarray, " z"]:
+        """Which unknowns are the user's and do not follow from others of them: all of the user's."""
+        return self.shown
+
+    @property
     def may_cancel(self) -> bool:
         """Whether highest derivatives may cancel between equations."""
         return False

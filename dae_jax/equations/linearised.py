@@ -21,7 +21,6 @@ from ..structure import (
     sigma_method,
     signature,
 )
-from ..systems import is_mechanism
 from .derivative_orders import Combination, Offsets, find_offsets
 from .index1_form import ReducedForm
 from .initial_rates import is_nonlinear, rates_of
@@ -190,11 +189,8 @@ class Pencil(eqx.Module):
 
     @property
     def _followed(self) -> Bool[np.ndarray, " n"]:
-        """Which of the user's variables are of index 2 and higher, those of a mechanism apart: its velocities follow from
-        positions that are controlled.
-        """
-        mechanism = isinstance(self.form, ResidualForm) and is_mechanism(self.form.system)
-        return self.form.shown & (np.array(self.outline.indices) > 1) & (not mechanism)
+        """Which of the user's variables of index 2 and higher are controlled by themselves."""
+        return self.form.independent & (np.array(self.outline.indices) > 1)
 
     def counted(self, dense: bool) -> Bool[np.ndarray, " n"]:
         """Which variables are of index 0 or 1, or seen by the user where values between steps are wanted."""

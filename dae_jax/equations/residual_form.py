@@ -82,6 +82,13 @@ class ResidualForm(eqx.Module):
         return np.arange(self.size) < self.layout.size
 
     @property
+    def independent(self) -> Bool[np.ndarray, " n"]:
+        """Which unknowns are the user's and do not follow from others of them that are controlled, as the velocities of a
+        mechanism do from its positions.
+        """
+        return self.shown & (not is_mechanism(self.system))
+
+    @property
     def may_cancel(self) -> bool:
         """Whether highest derivatives may cancel between equations: for a mechanism where constraints are redundant only."""
         return not is_mechanism(self.system)

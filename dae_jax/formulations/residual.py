@@ -43,9 +43,9 @@ class Residual(AbstractResidualFormulation):
             )
         if rank is not None:
             raise ValueError(
-                "Some constraints are redundant, which leaves their multipliers undetermined: a residual needs "
-                "independent ones. Remove the redundant constraints, or use a solver of the underlying ODE such as "
-                "OrthogonalProjection."
+                f"Some constraints are redundant (`rank` is {rank}), which leaves their multipliers undetermined: a residual "
+                "needs independent ones, also where `rank` is given. Remove the redundant constraints, or use a solver of the "
+                "underlying ODE such as OrthogonalProjection, for which `rank=` says how many are independent."
             )
         form, y = form.at_start(t, state)
         pencil = Pencil.of(form, y, self.variable_index)

@@ -3,9 +3,11 @@
 import functools
 from collections.abc import Callable
 
+from .charge_pump import charge_pump as charge_pump
 from .chemistry import akzo_nobel as akzo_nobel, robertson as robertson
 from .circuits import amplifier as amplifier, capacitor_loop as capacitor_loop
 from .double_pendulum import chain as chain, double_pendulum as double_pendulum
+from .elastic_crank import elastic_crank as elastic_crank
 from .hessenberg import hessenberg_2 as hessenberg_2, integrators as integrators, jay as jay
 from .mechanisms import four_bar as four_bar, slider_crank as slider_crank
 from .pendulum import (
@@ -16,6 +18,7 @@ from .pendulum import (
 from .scene import Drawing as Drawing, Scene as Scene
 from .stiff_mechanisms import andrews as andrews, car_axis as car_axis
 from .surfaces import bead_on_torus as bead_on_torus, knife_edge as knife_edge
+from .wheelset import wheelset as wheelset
 
 
 SCENES: dict[str, Callable[[], Scene]] = {
@@ -26,7 +29,9 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "capacitor-loop": capacitor_loop,
     "car-axis": car_axis,
     "chain": chain,
+    "charge-pump": charge_pump,
     "double-pendulum": double_pendulum,
+    "elastic-crank": elastic_crank,
     "four-bar": four_bar,
     "four-bar-redundant": functools.partial(four_bar, redundant=True),
     "hessenberg-2": hessenberg_2,

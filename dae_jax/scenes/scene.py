@@ -50,6 +50,7 @@ class Scene:
       of it and the reference.
     - `stiff`: explicit methods are out of the question.
     - `first`: where the solution changes over decades of time: when it begins to, in s.
+    - `kinks`: when sources have kinks or jumps, in s: for `jump_ts`.
     - `drawing`: how to draw it, a mechanism in the plane.
     - `paper`: the paper's figures that show it, by their names in `dae-jax compare`.
     """
@@ -66,6 +67,7 @@ class Scene:
     scale: float = 1.0
     stiff: bool = False
     first: float | None = None
+    kinks: tuple[float, ...] = ()
     drawing: Drawing | None = None
     paper: tuple[str, ...] = ()
 

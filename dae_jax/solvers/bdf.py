@@ -12,16 +12,18 @@ from jaxtyping import Array, Bool, Float, Int
 from ..linalg import implicit_root, rms_norm
 from .manifold import time_sign
 from .residual_steps import (
-    FULL,
     AbstractResidualSolver,
     Tolerances,
     at_the_floor,
     constant,
-    damped,
+    corrected,
+    goes_on,
     is_smallest,
     not_begun,
     of_step,
+    passes_a_kink,
     simplified_newton,
+    start_of,
     tolerances,
 )
 
@@ -123,6 +125,8 @@ class BDF(AbstractResidualSolver):
 
     **Arguments**
 
+    - `dense`: whether values between steps are wanted (`daesolve` sets it as `saveat` and `event` need it): then the user's
+      variables of index 2 and higher are in the error test too.
     - `rtol`, `atol`: by default those of the step-size controller, which must not differ.
 
     The step size follows from the order, so it is the solver that finds it, and the error it returns is the one from
@@ -167,7 +171,7 @@ class BDF(AbstractResidualSolver):
         star = [y0] + [b * row for b, row in zip(method.beta[1:], state.phi, strict=True)]
         y = sum(jnp.where(j <= k, row, 0) for j, row in enumerate(star))
         rate = sum(jnp.where(j <= k, g * row, 0) for j, (g, row) in enumerate(zip(method.gamma, star, strict=True)))
-        y1, (newton, factors, pivot) = implicit_root(
+        y1, (newton, passes, factors, pivot) = implicit_root(
             lambda y, params: params[0].residual(y),
             lambda params: _solve(*params),
             (_Step(args, sign, t1, h, method.c, y, rate), *constant((y0, state, is_smallest(t0, t1))), tol),
@@ -189,7 +193,7 @@ class BDF(AbstractResidualSolver):
         decision = _decision(constant(method), state, alike, held, size(change), sizes, higher)
         # What is algebraic may jump, and the history with it.
         smooth = method.tail * size(change * args.outline.differential) < 1
-        jumped = constant(is_smallest(t0, t1) & newton.converged & (decision.factor < SAFETY) & smooth)
+        jumped = constant(is_smallest(t0, t1) & newton.converged & (passes | (decision.factor < SAFETY)) & smooth)
         error = (jnp.where(jumped, 2, decision.factor) / SAFETY) ** -ERROR_ORDER
         failure = of_step(newton.converged, pivot, y0.size, error)
         error = jnp.where(newton.converged, error, jnp.inf) * tol.scale(y0, y1)
@@ -258,32 +262,36 @@ def _solve(step: _Step, y0: Any, state: _State, smallest: Any, tol: Tolerances) 
     """y at t₁, and how it was found: with the factors at hand first, with new ones where these fail, and in the smallest
     step with new ones for each correction.
     """
-    scale = step.pencil.weights(step.h) / tol.scale(y0)
+    weights, differential = step.pencil.weights(step.h), step.pencil.outline.differential
     changed = jnp.abs(step.c - state.c) > ALIKE * step.c
 
     def attempt(carry: Any) -> Any:
         tries, fresh, before, factors, _ = carry
         renew = (tries > 0) | changed
-        start = jnp.where(tries > 2, before.x, step.y)
+        start = start_of(tries, step.y, before.x)
         factors, pivot = lax.cond(renew, lambda: step.factor(start), lambda: (factors, jnp.full_like(step.c, jnp.inf)))
         correction = lambda y: -step.pencil.solve(factors, step.residual(y))
+        scale = lambda y: weights / tol.scale(y0, y)
         eta = jnp.where(renew, 1, state.eta)
         newton = lax.cond(
-            tries > 1,
-            lambda: damped(correction, start, scale, eta, tol),
-            lambda: simplified_newton(correction, start, scale, eta, tol),
+            smallest & (tries > 0),
+            lambda: corrected(correction, start, tries, scale, differential, eta, tol),
+            lambda: simplified_newton(correction, start, weights / tol.scale(y0), eta, tol),
         )
         return tries + 1, fresh | renew, newton, factors, pivot
 
     def again(carry: Any) -> Any:
         tries, fresh, newton, *_ = carry
-        return (tries == 0) | ~newton.converged & (~fresh | smallest & (tries < FULL))
+        return goes_on(tries, newton.converged, fresh, smallest)
 
     first = (0, jnp.asarray(False), not_begun(step.y, state.eta), state.factors, jnp.zeros_like(step.h))
     _, fresh, newton, factors, pivot = lax.while_loop(again, attempt, first)
     # The rate with new factors says nothing of the next step, for which they are old.
     eta = jnp.where(fresh, 1, newton.eta)
-    return jnp.where(newton.converged, newton.x, step.y), (newton._replace(x=None, eta=eta), factors, pivot)
+    passes = passes_a_kink(newton, smallest, state.steps > 0)
+    y = jnp.where(newton.converged | passes & differential, newton.x, jnp.where(passes, y0, step.y))
+    found = newton._replace(x=None, eta=eta, converged=newton.converged | passes)
+    return y, (found, passes, factors, pivot)
 
 
 class _Decision(NamedTuple):

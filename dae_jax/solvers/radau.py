@@ -26,16 +26,18 @@ from .radau_coefficients import (
     TRANSFORM,
 )
 from .residual_steps import (
-    FULL,
     AbstractResidualSolver,
     Tolerances,
     at_the_floor,
     constant,
-    damped,
+    corrected,
+    goes_on,
     is_smallest,
     not_begun,
     of_step,
+    passes_a_kink,
     simplified_newton,
+    start_of,
     tolerances,
 )
 
@@ -90,7 +92,11 @@ class _State(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """The equations of a step: a pytree, so that they can be differentiated."""
+    """The equations of a step: a pytree, so that they can be differentiated.
+
+    In the smallest step that time resolves the three stages are one, that of the implicit Euler method: where a variable
+    jumps, equations of both sides of the jump need have no solution together, those of one side have.
+    """
 
     pencil: Any
     sign: Any
@@ -99,14 +105,25 @@ class _Step(NamedTuple):
     y0: Float[Array, " n"]
 
     @property
+    def smallest(self) -> Any:
+        """Whether time resolves no smaller step."""
+        return is_smallest(self.t0, self.t1)
+
+    @property
+    def rates(self) -> Float[Array, "3 3"]:
+        """h times ẏ at the stages by zⱼ."""
+        inverse = jnp.asarray(INVERSE, self.y0.dtype)
+        return jnp.where(self.smallest, jnp.eye(3, dtype=inverse.dtype), inverse)
+
+    @property
     def h(self) -> Any:
         # A lane of a batch that has ended goes on with steps of length 0, whose derivatives are multiplied by 0.
         return jnp.where(self.t1 == self.t0, 1, self.t1 - self.t0)
 
     def stages(self, z: Float[Array, "3 n"]) -> Any:
         """(tᵢ, Yᵢ, ẏ at tᵢ) of each stage."""
-        rates = _combined(INVERSE, z)
-        times = [self.t1 if c == 1 else self.t0 + float(c) * self.h for c in NODES]
+        rates = [jnp.where(self.smallest, z[i], rate) for i, rate in enumerate(_combined(INVERSE, z))]
+        times = [self.t1 if c == 1 else jnp.where(self.smallest, self.t1, self.t0 + float(c) * self.h) for c in NODES]
         return [(self.sign * t, self.y0 + z[i], rates[i] * (self.sign / self.h)) for i, t in enumerate(times)]
 
     def at_stages(self, fn: Callable[..., Any], z: Float[Array, "3 n"]) -> list[Any]:
@@ -127,19 +144,21 @@ class _Step(NamedTuple):
         return j, self.sign * m
 
     def factor(self, jacobians: Any) -> tuple[Any, Float[Array, ""]]:
-        """The factors of γ/h M + J and (α + iβ)/h M + J, and the smallest pivot."""
+        """The factors of γ/h M + J, in the smallest step of M/h + J, and of (α + iβ)/h M + J, and the smallest pivot."""
         j, m = jacobians
-        real, pivot = self.pencil.factor(j, m, GAMMA / self.h, self.h)
+        real, pivot = self.pencil.factor(j, m, jnp.where(self.smallest, 1, GAMMA) / self.h, self.h)
         both, other = self.pencil.factor(j, m, lax.complex(ALPHA / self.h, BETA / self.h), self.h)
         return (real, both), jnp.minimum(pivot, other)
 
     def correction(self, factors: Any, z: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
         """Δz of simplified Newton, decoupled into a real and a complex system."""
         real, both = factors
-        first, second, third = _combined(BACK, self.residuals(z))
-        w = self.pencil.solve(real, first)
+        residuals = self.residuals(z)
+        first, second, third = _combined(BACK, residuals)
+        w = self.pencil.solve(real, jnp.where(self.smallest, residuals[2], first))
         v = self.pencil.solve(both, lax.complex(second, third))
-        return -jnp.stack(_combined(TRANSFORM, [w, jnp.real(v), jnp.imag(v)]))
+        stages = _combined(TRANSFORM, [w, jnp.real(v), jnp.imag(v)])
+        return -jnp.stack([jnp.where(self.smallest, w, stage) for stage in stages])
 
 
 class RadauIIA5(AbstractResidualSolver):
@@ -152,8 +171,8 @@ class RadauIIA5(AbstractResidualSolver):
     errors of variables of index k count with h^(k−1). Orders: 5 for ODEs and index 1; for index 2, 5 for the
     differential variables and 3 for the algebraic ones; for index 3, 5, 3 and 2 for variables of index 1, 2 and 3.
     Constraints of the form hold at the end of each step to the tolerance of Newton's method. Algebraic variables may jump
-    with a source: in the smallest step that time resolves, each correction has a Jacobian of its own, and the error of
-    differential variables alone counts.
+    with a source or where they switch: the smallest step that time resolves is one of the implicit Euler method, in which
+    each correction has a Jacobian of its own, and the error of differential variables alone counts.
 
     That estimate does not know how an algebraic variable moves within a step, nor what comes of it for variables of index 2
     and higher, which follow from derivatives. The error of the polynomial through the step's points counts too, for all
@@ -206,10 +225,10 @@ class RadauIIA5(AbstractResidualSolver):
         tol = tolerances(self.rtol, self.atol, y0.dtype)
         # The unknowns of a stage are interleaved, so that a band stays one.
         apart = lambda z: z.reshape(-1, 3).T
-        flat, (newton, jumped, jacobians, factors, pivot) = implicit_root(
+        flat, (newton, jacobians, factors, pivot) = implicit_root(
             lambda z, params: jnp.stack(params[0].residuals(apart(z)), 1).reshape(-1),
             lambda params: _solve(*params),
-            (step, *constant((state, is_smallest(t0, t1))), tol),
+            (step, constant(state), tol),
             linear_solve=_linear_solve,
             jacobian=lambda z, params: _coupled(params[0], apart(z)),
         )
@@ -220,17 +239,18 @@ class RadauIIA5(AbstractResidualSolver):
             weights = args.weights(step.h, tol.raised()) * args.between(self.dense)
             between = _between(*constant((state, step.h, z))) * weights
             counted = jnp.where(jnp.abs(between) > jnp.abs(scaled), between, scaled)
-        smallest = is_smallest(t0, t1)
-        jumped = jumped | smallest & ~(tol.norm(counted, y0, y1) < 1)
-        scaled = jnp.where(smallest, scaled * args.outline.differential, counted)
+        rates, smallest = step.stages(z)[2][2], step.smallest
+        # What is algebraic may jump in the smallest step.
+        bend = constant((rates - state.rates) * (step.h / 2)) * args.outline.differential
+        scaled = jnp.where(smallest, bend, counted)
         failure = of_step(newton.converged, pivot, y0.size, tol.norm(scaled, y0, y1))
         y1, scaled, result = at_the_floor(failure, t0, t1, y0, y1, scaled)
-        rates = _combined(INVERSE, z)[2] * (step.sign / step.h)
         slow = (newton.theta > FAST) & (newton.count > 1)
         # What jumped says nothing of the next step.
-        new = _State(z, jnp.where(jumped, 0, step.h), rates, jacobians, factors, step.h, slow, newton.eta)
-        # In a step that a jump is in, the value is that after it.
-        dense = {"y0": jnp.where(jumped, y0 + z[2], y0), "z": jnp.where(jumped, 0, z)}
+        size = jnp.where(smallest, 0, step.h)
+        new = _State(z, size, rates, jacobians, factors, size, slow, newton.eta)
+        # In a step that a jump may be in, the value is that after it.
+        dense = {"y0": jnp.where(smallest, y0 + z[2], y0), "z": jnp.where(smallest, 0, z)}
         return y1, scaled, dense, constant(new), result
 
 
@@ -241,18 +261,19 @@ def _predicted(state: _State, h: Any) -> Float[Array, "3 n"]:
     return jnp.where(state.h == 0, 0, ahead)
 
 
-def _solve(step: _Step, state: _State, smallest: Any, tol: Tolerances) -> Any:
+def _solve(step: _Step, state: _State, tol: Tolerances) -> Any:
     """The stages, and how they were found: with the Jacobian at hand first, with new ones where these fail, and in the
     smallest step with new ones for each correction.
     """
-    h, predicted = step.h, _predicted(state, step.h)
-    scale = step.pencil.weights(h, tol.raised()) / tol.scale(step.y0)
+    h, smallest = step.h, step.smallest
+    predicted = jnp.where(smallest, 0, _predicted(state, h))
+    weights, differential = step.pencil.weights(h, tol.raised()), step.pencil.outline.differential
 
     def attempt(carry: Any) -> Any:
         tries, fresh, before, jacobians, factors, _ = carry
-        renew, full = (tries > 0) | state.refresh, tries > 2
-        start = jnp.where(full, before.x, predicted)
-        t, y = jnp.where(full, step.t1, step.t0), jnp.where(full, step.y0 + before.x[2], step.y0)
+        renew = (tries > 0) | state.refresh | smallest
+        start = start_of(tries, predicted, before.x)
+        t, y = jnp.where(smallest, step.t1, step.t0), jnp.where(smallest, step.y0 + start[2], step.y0)
         evaluate = lambda: step.jacobians(step.sign * t, y, state.rates)
         jacobians = lax.cond(renew, evaluate, lambda: jacobians)
         infinite = jnp.full_like(h, jnp.inf)
@@ -260,21 +281,25 @@ def _solve(step: _Step, state: _State, smallest: Any, tol: Tolerances) -> Any:
             renew | (h != state.factored), lambda: step.factor(jacobians), lambda: (factors, infinite)
         )
         correction = lambda z: step.correction(factors, z)
+        scale = lambda z: weights / tol.scale(step.y0, step.y0 + z[2])
         newton = lax.cond(
-            tries > 1,
-            lambda: damped(correction, start, scale, state.eta, tol),
-            lambda: simplified_newton(correction, start, scale, state.eta, tol),
+            smallest & (tries > 0),
+            lambda: corrected(correction, start, tries, scale, differential, state.eta, tol),
+            lambda: simplified_newton(correction, start, weights / tol.scale(step.y0), state.eta, tol),
         )
         return tries + 1, fresh | renew, newton, jacobians, factors, pivot
 
     def again(carry: Any) -> Any:
         tries, fresh, newton, *_ = carry
-        return (tries == 0) | ~newton.converged & (~fresh | smallest & (tries < FULL))
+        return goes_on(tries, newton.converged, fresh, smallest)
 
     none = not_begun(predicted, state.eta)
     first = (0, jnp.asarray(False), none, state.jacobians, state.factors, h)
-    tries, _, newton, jacobians, factors, pivot = lax.while_loop(again, attempt, first)
-    return newton.x.T.reshape(-1), (newton._replace(x=None), tries > 2, jacobians, factors, pivot)
+    _, _, newton, jacobians, factors, pivot = lax.while_loop(again, attempt, first)
+    passes = passes_a_kink(newton, smallest, state.h != 0)
+    z = jnp.where(passes & ~differential, 0, newton.x)
+    found = newton._replace(x=None, converged=newton.converged | passes)
+    return z.T.reshape(-1), (found, jacobians, factors, pivot)
 
 
 def _error(step: _Step, factor: Any, z: Any, tol: Tolerances) -> Float[Array, " n"]:
@@ -307,7 +332,7 @@ def _coupled(step: _Step, z: Float[Array, "3 n"]) -> Any:
     """The Jacobian of all stages at the solution, in the storage of their unknowns interleaved."""
     found = step.at_stages(step.jacobians, z)
     storage, matrix = step.pencil.storage.coupled(
-        [j for j, _ in found], [m for _, m in found], jnp.asarray(INVERSE, z.dtype) / step.h
+        [j for j, _ in found], [m for _, m in found], step.rates / step.h
     )
     return storage, matrix, jnp.repeat(step.pencil.column_scale(step.h), 3)
 

@@ -20,8 +20,9 @@ NOISE = 0.33
 NOISY = 1000
 # How often a correction is halved where algebraic variables jump.
 HALVINGS = 40
-# Where algebraic variables jump, Newton's method with a Jacobian of its own for each of its corrections.
-FULL = 30
+# Where algebraic variables jump, Newton's method has a Jacobian of its own for each of its corrections: damped ones first, for
+# a whole one may end where a function overflows; then whole ones, for a damped iteration may end before a kink.
+DAMPED, WHOLE = 40, 6
 
 
 class AbstractResidualSolver(diffrax.AbstractAdaptiveSolver):
@@ -102,7 +103,8 @@ def tolerances(rtol: Any, atol: Any, dtype: Any) -> Tolerances:
 
 class Newton(NamedTuple):
     """An iteration that ended, or has yet to begin: the solution `x`, the number of corrections, the size of the last
-    one, η = θ/(1 − θ) and θ, the rate at which they shrink.
+    one, η = θ/(1 − θ) and θ, the rate at which they shrink; `carried`: whether the last left the differential variables as
+    they were.
     """
 
     x: Any
@@ -112,12 +114,13 @@ class Newton(NamedTuple):
     theta: Any
     converged: Any
     diverged: Any
+    carried: Any
 
 
 def not_begun(start: Any, eta: Any) -> Newton:
     """The iteration before its first correction."""
     zero, no = jnp.zeros((), start.dtype), jnp.asarray(False)
-    return Newton(start, 0, zero, eta, zero, no, no)
+    return Newton(start, 0, zero, eta, zero, no, no, no)
 
 
 def simplified_newton(
@@ -145,33 +148,62 @@ def simplified_newton(
         converged = (eta * size <= tol.newton) & ~stagnant | (size <= tol.roundoff) | (stagnant & (size <= NOISE))
         diverged = ~jnp.isfinite(size) | (~first & hopeless & ~converged & (not tol.patient))
         theta = jnp.where(first, 0, theta)
-        return Newton(s.x + dx, s.count + 1, size, eta, theta, converged & jnp.isfinite(size), diverged)
+        return Newton(s.x + dx, s.count + 1, size, eta, theta, converged & jnp.isfinite(size), diverged, s.carried)
 
     return lax.while_loop(goes_on, correct, not_begun(start, eta))
 
 
-def damped(correction: Callable[[Any], Any], x: Any, scale: Any, eta: Any, tol: Tolerances) -> Newton:
-    """One correction x + λ Δx, λ the largest power of ½ with which the next correction by the same matrix is smaller,
-    ‖Δx̄‖ ≤ (1 − λ/2) ‖Δx‖: where a variable jumps, a whole one may end where a function overflows. Converged where the next
-    one is small.
+def goes_on(tries: Any, converged: Any, fresh: Any, smallest: Any) -> Any:
+    """Whether a step is tried again: with new factors, and many times where it can be no smaller."""
+    return (tries == 0) | ~converged & (~fresh | smallest & (tries <= DAMPED + WHOLE))
+
+
+def start_of(tries: Any, predicted: Any, before: Any) -> Any:
+    """Where the next of the tries of a step starts: where the last ended, for corrections of one iteration."""
+    return jnp.where((tries <= 1) | (tries == DAMPED + 1), predicted, before)
+
+
+def corrected(
+    correction: Callable[[Any], Any],
+    x: Any,
+    tries: Any,
+    scale: Callable[[Any], Any],
+    differential: Any,
+    eta: Any,
+    tol: Tolerances,
+) -> Newton:
+    """One correction x + λ Δx, in the first tries with λ the largest power of ½ with which the next correction by the same
+    matrix is smaller, ‖Δx̄‖ ≤ (1 − λ/2) ‖Δx‖; then a whole one. Converged where it is whole and the next one is small;
+    `scale(x)` is what a correction counts near x.
 
     Source: P. Deuflhard, *Newton Methods for Nonlinear Problems*, sec. 3.1.4 (the restricted monotonicity test).
     """
     dx = correction(x)
-    size = rms_norm(dx * scale)
+    scale_there = scale(x + dx)
+    size = rms_norm(dx * scale_there)
 
     def halve(carry: Any) -> Any:
         part, *_, count = carry
-        ahead = rms_norm(correction(x + part * dx) * scale)
-        shorter = ahead <= (1 - part / 2) * size
-        return jnp.where(shorter, part, part / 2), ahead, shorter, count + 1
+        ahead = rms_norm(correction(x + part * dx) * scale_there)
+        taken = (tries > DAMPED) | (ahead <= (1 - part / 2) * size)
+        return jnp.where(taken, part, part / 2), ahead, taken, count + 1
 
     begin = jnp.ones((), x.dtype), jnp.asarray(jnp.inf, x.dtype), jnp.asarray(False), 0
-    part, ahead, shorter, _ = lax.while_loop(lambda carry: ~carry[2] & (carry[3] < HALVINGS), halve, begin)
+    part, ahead, taken, _ = lax.while_loop(lambda carry: ~carry[2] & (carry[3] < HALVINGS), halve, begin)
     # Corrections that are round-off grow and shrink as they please.
-    converged = (ahead <= tol.newton) & shorter | (size <= tol.roundoff)
-    x = jnp.where(shorter | converged, x + part * dx, x)
-    return Newton(x, 1, size, eta, jnp.zeros_like(size), converged & jnp.isfinite(size), ~jnp.isfinite(size))
+    noise = (size <= tol.roundoff) | ~(ahead < size) & (size <= NOISE)
+    converged = (ahead <= tol.newton) & taken & (part == 1) | noise
+    x = jnp.where(taken | converged, x + part * dx, x)
+    finite = jnp.isfinite(size)
+    carried = finite & (rms_norm(dx * scale_there * differential) <= NOISE)
+    return Newton(x, 1, size, eta, jnp.zeros_like(size), converged & finite, ~finite, carried)
+
+
+def passes_a_kink(newton: Newton, smallest: Any, after_others: Any) -> Any:
+    """Whether a smallest step, `after_others`, counts although its algebraic variables were not found: on a kink that the
+    differential ones pass unmoved, Newton's method may go to and fro between the sides. The step after it has to find them.
+    """
+    return smallest & after_others & ~newton.converged & newton.carried
 
 
 class Failure(NamedTuple):
