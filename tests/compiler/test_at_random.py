@@ -70,7 +70,7 @@ def test_a_broken_rule_is_found(name):
     assert len(said.splitlines()) <= 11
 
 
-@pytest.mark.parametrize(("kind", "seed"), [(systems.mechanism, 1), (systems.mechanism, 17), (systems.equations, 2)])
+@pytest.mark.parametrize(("kind", "seed"), [(systems.mechanism, 1), (systems.equations, 2)])
 def test_systems_with_and_without_the_compiler(kind, seed):
     assert kind(seed).difference() <= systems.RTOL
 
