@@ -59,7 +59,9 @@ def test_bits(dtype):
     same(fn, edges(dtype, (LANES, 5)), edges(dtype, (LANES, 40)))
 
 
-@pytest.mark.parametrize(("dtype", "to"), [("float64", "int64"), ("uint32", "float32"), ("uint16", "int16"), ("int8", "int8")])
+@pytest.mark.parametrize(
+    ("dtype", "to"), [("float64", "int64"), ("uint32", "float32"), ("uint16", "int16"), ("int8", "int8")]
+)
 def test_bits_as_another_type(dtype, to):
     cast = lambda x: LAX.bitcast_convert_type(LAX.bitcast_convert_type(x, to), dtype)
     fn = lambda x, y: [LAX.bitcast_convert_type(x, to), LAX.bitcast_convert_type(y, to), cast(x), cast(y[::-1])]
@@ -73,7 +75,9 @@ def test_bits_as_another_type(dtype, to):
 def test_total_order(dtype):
     def fn(x, y):
         tables = [jnp.searchsorted(np.float64([*range(30)]) ** 2, z[:2].astype(float)) for z in (x, y)]
-        compared = [f.bind(z, z[::-1]) for z in (x, y) for f in (lax_total.eq_to_p, lax_total.le_to_p, lax_total.lt_to_p)]
+        compared = [
+            f.bind(z, z[::-1]) for z in (x, y) for f in (lax_total.eq_to_p, lax_total.le_to_p, lax_total.lt_to_p)
+        ]
         return [*compared, *tables]
 
     same(fn, edges(dtype, (LANES, 5)), edges(dtype, (LANES, 40)))
@@ -132,7 +136,11 @@ def test_tables_of_any_size():
     table = np.linspace(0, 1, 10_000) ** 2
 
     def fn(x):
-        return [jnp.searchsorted(table, x), jnp.interp(x, table, np.sin(table)), jnp.searchsorted(table, x, side="right")]
+        return [
+            jnp.searchsorted(table, x),
+            jnp.interp(x, table, np.sin(table)),
+            jnp.searchsorted(table, x, side="right"),
+        ]
 
     same(fn, np.random.default_rng(0).uniform(-0.1, 1.1, (LANES, 3)), ulps=8)
 
@@ -142,7 +150,12 @@ def test_negative_widths():
 
     def fn(x, y):
         cut = [LAX.pad(z, 7.0, [(-2, 1, 1)]) for z in (x, y)]
-        return [*cut, LAX.pad(y.reshape(4, 10), 7.0, [(1, -2, 0), (-3, -1, 2)]), jax.grad(jnp.prod)(x), jax.grad(jnp.prod)(y)]
+        return [
+            *cut,
+            LAX.pad(y.reshape(4, 10), 7.0, [(1, -2, 0), (-3, -1, 2)]),
+            jax.grad(jnp.prod)(x),
+            jax.grad(jnp.prod)(y),
+        ]
 
     same(fn, np.ones((LANES, 5)) * 2.0, np.full((LANES, 40), 0.5))
 
@@ -150,7 +163,11 @@ def test_negative_widths():
 def test_many_complex_numbers():
     def fn(x):
         z = (x + 0.03j * x[::-1]).reshape(10, 6)
-        return [f(w) for w in (jnp.prod(z), jnp.prod(z, 1), jnp.cumprod(z, 0), z**-2, jnp.square(z)) for f in (jnp.real, jnp.imag)]
+        return [
+            f(w)
+            for w in (jnp.prod(z), jnp.prod(z, 1), jnp.cumprod(z, 0), z**-2, jnp.square(z))
+            for f in (jnp.real, jnp.imag)
+        ]
 
     def equal(x, y):
         z = x + 1j * y
@@ -164,7 +181,9 @@ def test_many_complex_numbers():
 def test_special_functions(dtype):
     def fn(x, y):
         inside = [z / 4 for z in (x, y)]
-        return [f(z) for z in (*inside, *(jnp.floor(z) for z in (x, y))) for f in (LAX.erf_inv, LAX.digamma, LAX.lgamma)]
+        return [
+            f(z) for z in (*inside, *(jnp.floor(z) for z in (x, y))) for f in (LAX.erf_inv, LAX.digamma, LAX.lgamma)
+        ]
 
     rng = np.random.default_rng(0)
     numbers = [rng.uniform(-5, 5, (LANES, n)).astype(dtype) for n in (5, 40)]
@@ -188,7 +207,9 @@ def test_random_numbers():
         def turn(i, carry):
             key, total = carry
             key, now = jax.random.split(jax.random.fold_in(key, i))
-            more = jax.lax.cond(total[0] > 0, lambda k: jax.random.uniform(k, (2,)), lambda k: -jax.random.uniform(k, (2,)), now)
+            more = jax.lax.cond(
+                total[0] > 0, lambda k: jax.random.uniform(k, (2,)), lambda k: -jax.random.uniform(k, (2,)), now
+            )
             return key, total + more
 
         end, total = jax.lax.fori_loop(0, 4, turn, (key, x))

@@ -51,7 +51,9 @@ class TestCost:
 class TestCheaperForms:
     def test_a_large_module_is_compiled_without_passes(self, monkeypatch):
         monkeypatch.setattr(object_code, "HEAVY", 0)
-        monkeypatch.setattr(object_code, "_optimise", lambda _: (_ for _ in ()).throw(AssertionError("passes were run")))
+        monkeypatch.setattr(
+            object_code, "_optimise", lambda _: (_ for _ in ()).throw(AssertionError("passes were run"))
+        )
         found = compiled(jax.make_jaxpr(lambda x: jnp.sum(jnp.sin(x) * jnp.cos(x)) + 0.731)(X))(X)
         np.testing.assert_allclose(found[0], np.sum(np.sin(X) * np.cos(X)) + 0.731, rtol=1e-14)
 

@@ -35,6 +35,8 @@ def for_each(
     code: Instructions, shape: Sequence[int], action: Callable[[list[Any]], None], few: int = THRESHOLDS.per_turn
 ) -> None:
     """Does something with each index, in loops whose body has the last `few` written out."""
+    if 0 in shape:
+        return
     outer, size = len(shape), 1
     while outer and size * shape[outer - 1] <= few:
         outer, size = outer - 1, size * shape[outer - 1]

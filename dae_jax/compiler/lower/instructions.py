@@ -83,6 +83,8 @@ class Instructions:
         """An operand without its type."""
         if isinstance(x, Value):
             return self.in_lanes(x).name if lanes else x.name
+        if np.iscomplexobj(x):
+            raise TypeError("a complex number where a real one is written")
         if kind == "double" or kind == "float":
             literal = f"0x{struct.pack('>d', float(x)).hex().upper()}"
         else:
@@ -237,7 +239,7 @@ class Instructions:
     def select(self, condition: Any, yes: Any, no: Any, kind: str) -> Any:
         if yes is no:
             return yes
-        if isinstance(yes, Complex) or isinstance(no, Complex):
+        if any(isinstance(x, Complex) or np.iscomplexobj(x) for x in (yes, no)):
             (a, b), (c, d) = parts(yes), parts(no)
             return Complex(self.select(condition, a, c, kind), self.select(condition, b, d, kind))
         if not isinstance(condition, Value):

@@ -1,0 +1,1 @@
+"""Programs put together at random, by our compiler and by XLA."""
