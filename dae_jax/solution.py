@@ -51,6 +51,10 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "The solution is not finite: the force, the mass matrix or a constraint returned NaN or infinity, a mass became "
         "negative, the constraints became dependent, or the steps are too large for the method."
     )
+    times_outside = (
+        "A time to save at (`saveat.ts`) lies outside of t0 to t1, if only by round-off: nothing is known there. Make t1 the last "
+        "of these times."
+    )
     undefined_condition = (
         "The condition of an event is not a number (NaN) where the solve ended: an event there is not seen. Let it be defined "
         "on either side of its zero."

@@ -117,3 +117,22 @@ def test_pictures_leave_padding_out():
             assert np.isfinite(line.get_xdata()).all()
             assert len(line.get_xdata()) <= saved.sum()
         assert not any("inf" in text.get_text() for legend in figure.legends for text in legend.get_texts())
+
+
+@pytest.mark.parametrize("beyond", ["end", "start"])
+def test_a_time_beyond_the_ends_is_no_padding(beyond):
+    """By one unit in the last place, where it is traced: nothing was saved there."""
+    t1 = 1.2e-6
+    last = 1200 * 1e-9 if beyond == "end" else -1e-22
+    system = dae_jax.SemiExplicitDAE(lambda t, x, z, args: -z, lambda t, x, z, args: z - x)
+
+    def solve(ts):
+        sol = dae_jax.daesolve(
+            system, diffrax.Tsit5(), 0.0, t1, None, (jnp.ones(1), jnp.ones(1)), saveat=diffrax.SaveAt(ts=ts), throw=False
+        )
+        return sol.result == dae_jax.RESULTS.times_outside, sol.result == dae_jax.RESULTS.successful
+
+    assert t1 < 1200 * 1e-9
+    ts = jnp.sort(jnp.array([6e-7, last]))
+    assert jax.jit(solve)(ts) == (True, False)
+    assert jax.jit(solve)(jnp.array([0.0, t1])) == (False, True)

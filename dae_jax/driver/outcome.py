@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from ..solution import RESULTS, DAESolution, all_finite, precision_of
 from ..solvers import takes_residuals
 from .problem import Problem
-from .start import is_saved_part
+from .start import is_saved_part, saved_parts
 
 
 def judged(solve: Any, out: Any, problem: Problem, found: Any) -> DAESolution:
@@ -37,6 +37,7 @@ def judged(solve: Any, out: Any, problem: Problem, found: Any) -> DAESolution:
     stuck = jnp.any(jnp.stack([code == name for name in (*stuck, RESULTS.singular_iteration_matrix)]))
     code = RESULTS.where(stuck & end.singular, RESULTS.singular_configuration, code)
     code = RESULTS.where(went_well & ~end.near, RESULTS.off_constraints, code)
+    code = RESULTS.where(went_well & _outside(solve.saveat, problem), RESULTS.times_outside, code)
     code = RESULTS.where(end.masses & (end.masses_ahead | went_well), code, RESULTS.irregular_mass)
     for wrong, name in enumerate(("inconsistent_start", "dependent_constraints", "irregular_mass", "ambiguous_start"), 1):
         code = RESULTS.where(start == wrong, getattr(RESULTS, name), code)
@@ -50,3 +51,10 @@ def _saved(saveat: Any, ts: Any, ys: Any) -> list[tuple[Any, Any]]:
     return [
         (t, y) for t, y in zip(structure.flatten_up_to(ts), structure.flatten_up_to(ys), strict=True) if t is not None
     ]
+
+
+def _outside(saveat: Any, problem: Problem) -> Any:
+    """Whether a time to save at is beyond an end of the solve: diffrax pads it like a time that was not reached."""
+    low, high = jnp.minimum(problem.t0, problem.t1), jnp.maximum(problem.t0, problem.t1)
+    times = [part.ts for part in saved_parts(saveat) if part.ts is not None]
+    return jnp.any(jnp.stack([jnp.any((ts < low) | (ts > high)) for ts in times])) if times else jnp.asarray(False)

@@ -2,6 +2,7 @@
 
 import functools
 import importlib
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -197,7 +198,7 @@ PENDULUM = (oscillator, jnp.array([1.0, 0.3]), 9.81)
 ROBERTSON = (robertson, jnp.array([1.0, 0.0, 0.0]), 3e7)
 
 
-def solution(y0, k, field, solver, **options):
+def solution(y0, k, field, solver, **options) -> Any:
     settings = {
         "dt0": None,
         "stepsize_controller": diffrax.PIDController(rtol=1e-6, atol=1e-9),
