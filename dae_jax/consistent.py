@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .equations.constraint_jacobian import Rank, mass_solve
 from .equations.initial_rates import is_nonlinear, rates_of
-from .equations.linearised import Pencil
+from .equations.linearised import LinearisedResidual
 from .equations.mechanical import MechanicalODE
 from .equations.regularity import has_rank, is_near_constraints, mass_is_regular, weakest
 from .equations.residual_form import ResidualForm
@@ -90,17 +90,17 @@ def unsolved(system: System, t: Any, state: Any, args: Any) -> Unsolved:
     form = ResidualForm.of(system, t, state, args)
     y = form.encode(state)
     t = jnp.asarray(t, y.dtype)
-    pencil = Pencil.of(form, y)
-    if pencil.outline.hidden:
+    linearised = LinearisedResidual.of(form, y)
+    if linearised.structure.hidden:
         ode = StructuralODE.of(form, y.dtype, complete=True)
         return _left_over(ode, t, ode.encode(t, state))
     several = rates_of(form, t, y)[1] if is_nonlinear(form, y.dtype) else jnp.asarray(False)
-    yd = pencil.rates(t, y)
-    j, m = pencil.jacobians(t, y, yd)
+    yd = linearised.rates(t, y)
+    j, m = linearised.jacobians(t, y, yd)
     size = lambda x: 1 + jnp.max(jnp.abs(x))
     ones = jnp.ones_like(y)
-    terms = pencil.storage.apply(jnp.abs(j), size(y) * ones) + pencil.storage.apply(jnp.abs(m), size(yd) * ones)
-    return Unsolved(pencil.residual(t, y, yd), jnp.finfo(y.dtype).eps ** 0.5 * terms, form.equations, several)
+    terms = linearised.storage.apply(jnp.abs(j), size(y) * ones) + linearised.storage.apply(jnp.abs(m), size(yd) * ones)
+    return Unsolved(linearised.residual(t, y, yd), jnp.finfo(y.dtype).eps ** 0.5 * terms, form.equations, several)
 
 
 def _left_over(ode: StructuralODE, t: Any, y: Float[Array, " N"]) -> Unsolved:

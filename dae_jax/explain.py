@@ -13,7 +13,7 @@ from .compiler import Decision, decision, equations, one_kernel_enabled, without
 from .driver.program import Solve
 from .driver.start import refuse_bad_start, refuse_no_time
 from .equations.constraint_jacobian import SparseNormals
-from .equations.linearised import Pencil
+from .equations.linearised import LinearisedResidual
 from .equations.mechanical import MechanicalODE
 from .equations.residual_form import ResidualForm
 from .equations.structural_ode import StructuralODE
@@ -202,8 +202,8 @@ def explain(
     compiled = _compiled(solve, jaxpr, [any(x is start for start in starts) for x in arrays])
     method = f"{(formulation or solve.formulation).name}, {_name(solver)}"
     if takes_residuals(solve.solver):
-        y, pencil = solve.formulation.encode(system, t0, y0, args)
-        return _of_residual(pencil, t0, y, method, precision, compiled)
+        y, linearised = solve.formulation.encode(system, t0, y0, args)
+        return _of_residual(linearised, t0, y, method, precision, compiled)
     if solve.formulation.selects_states or not is_mechanism(system):
         ode = StructuralODE.of(ResidualForm.of(system, t0, y0, args), t0.dtype)
         y = jax.eval_shape(ode.encode, t0, y0)
@@ -255,20 +255,20 @@ def _compiled(solve: Solve, jaxpr: Any, starts: list[bool]) -> dict[str, Any]:
 
 
 def _of_residual(
-    pencil: Pencil, t0: Any, y: Any, method: str, precision: str, compiled: dict[str, Any]
+    linearised: LinearisedResidual, t0: Any, y: Any, method: str, precision: str, compiled: dict[str, Any]
 ) -> ResidualPlan:
-    outline, n = pencil.outline, y.size
-    colours = tuple(n if c is None else len(c.seeds) for c in (outline.by_y, outline.by_rate))
+    structure, n = linearised.structure, y.size
+    colours = tuple(n if c is None else len(c.seeds) for c in (structure.by_y, structure.by_rate))
     return ResidualPlan(
         method=method,
         precision=precision,
-        linear_solver=outline.storage.describe(),
-        operations=_operations(lambda y: pencil.residual(t0, y, y), y),
+        linear_solver=structure.storage.describe(),
+        operations=_operations(lambda y: linearised.residual(t0, y, y), y),
         **compiled,
         left_out=("directional derivatives of structural zeros",) if sum(colours) < 2 * n else (),
         unknowns=n,
-        indices=outline.indices,
-        derivatives=int(outline.differential.sum()),
+        indices=structure.indices,
+        derivatives=int(structure.differential.sum()),
         colours=colours,
     )
 

@@ -14,7 +14,7 @@ from .manifold_ode import at_one_instant
 from .structural_ode import StructuralODE
 
 
-class ReducedForm(eqx.Module):
+class Index1Form(eqx.Module):
     """0 = F(t, z, ż) of index 1 for z = (Y, X), the state of a `StructuralODE` and the derivatives of order Dⱼ:
 
         0 = Fᵢ^(Cᵢ)(t, Y, X)                                for every equation,
@@ -71,7 +71,7 @@ class ReducedForm(eqx.Module):
         """What z itself says of ż: the rate of all of Y."""
         return jnp.concatenate([take(z, self.ode.orders.derivatives), jnp.zeros(self.ode.form.size, z.dtype)])
 
-    def with_all_candidates(self, dtype: Any) -> "ReducedForm":
+    def with_all_candidates(self, dtype: Any) -> "Index1Form":
         """With every entry that may become a dummy derivative marked by a half, for structural analysis: whatever is
         selected, its equations depend on no more.
         """
@@ -85,7 +85,7 @@ class ReducedForm(eqx.Module):
                 row = np.zeros(orders.size)
                 row[place[pattern[i] & (place >= 0)]] = 0.5
                 rows.append(row)
-        return ReducedForm(self.ode, jnp.asarray(np.reshape(rows, (len(rows), orders.size)), dtype))
+        return Index1Form(self.ode, jnp.asarray(np.reshape(rows, (len(rows), orders.size)), dtype))
 
     @at_one_instant
     def residual(self, t: Any, z: Float[Array, " z"], zd: Float[Array, " z"]) -> Float[Array, " z"]:

@@ -22,7 +22,7 @@ from ..structure import (
     signature,
 )
 from .derivative_orders import Combination, Offsets, find_offsets
-from .index1_form import ReducedForm
+from .index1_form import Index1Form
 from .initial_rates import is_nonlinear, rates_of
 from .manifold_ode import at_one_instant
 from .residual_form import ResidualForm
@@ -44,7 +44,7 @@ class Compression:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Outline:
+class JacobianStructure:
     """What is known of a residual's linearisation before it is evaluated. Compared by identity: keep one for a pattern.
 
     `indices`, `offsets`: the index of each variable, and how often it is differentiated (d of the Σ-method);
@@ -63,20 +63,20 @@ class Outline:
     by_rate: Compression | None
 
 
-class Pencil(eqx.Module):
+class LinearisedResidual(eqx.Module):
     """J + c M with J = ∂F/∂y and M = ∂F/∂ẏ, of a residual. It travels through `diffrax.diffeqsolve` as `args`.
 
     `start`: ẏ where a solve starts.
     """
 
-    form: ResidualForm | ReducedForm
-    outline: Outline = eqx.field(static=True)
+    form: ResidualForm | Index1Form
+    structure: JacobianStructure = eqx.field(static=True)
     start: Float[Array, " n"] | None = None
 
     @classmethod
     def of(
-        cls, form: ResidualForm | ReducedForm, y: Float[Array, " n"], indices: tuple[int, ...] | None = None
-    ) -> "Pencil":
+        cls, form: ResidualForm | Index1Form, y: Float[Array, " n"], indices: tuple[int, ...] | None = None
+    ) -> "LinearisedResidual":
         """Finds, while tracing, which equation depends on which variable and derivative.
 
         Errors: `ValueError` for a structurally singular system.
@@ -96,7 +96,7 @@ class Pencil(eqx.Module):
     @property
     def storage(self) -> Storage:
         """How J and M are stored."""
-        return self.outline.storage
+        return self.structure.storage
 
     def decode(self, t: Any, y: Float[Array, " n"]) -> Any:
         """The state in the user's structure."""
@@ -113,11 +113,11 @@ class Pencil(eqx.Module):
 
     @at_one_instant
     def _by_y(self, t: Any, y: Float[Array, " n"], yd: Float[Array, " n"]) -> Array:
-        return self._by(1, self.outline.by_y, t, y, yd)
+        return self._by(1, self.structure.by_y, t, y, yd)
 
     @at_one_instant
     def _by_rate(self, t: Any, y: Float[Array, " n"], yd: Float[Array, " n"]) -> Array:
-        return self._by(2, self.outline.by_rate, t, y, yd)
+        return self._by(2, self.structure.by_rate, t, y, yd)
 
     def _by(self, argument: int, compression: Compression | None, *point: Any) -> Array:
         """The stored entries of the derivative of F(t, y, ẏ) by one of its arguments."""
@@ -140,7 +140,7 @@ class Pencil(eqx.Module):
 
     def column_scale(self, h: Any) -> Float[Array, " n"]:
         """h^dⱼ."""
-        return powers(jnp.minimum(jnp.abs(h), 1), self.outline.offsets)
+        return powers(jnp.minimum(jnp.abs(h), 1), self.structure.offsets)
 
     def solve(self, factors: Any, b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
         """x with (J + c M) x = b."""
@@ -149,7 +149,7 @@ class Pencil(eqx.Module):
 
     def _combined(self, rows: Any, c: Any) -> Any:
         """Rows, or right-hand sides, in the combination in which highest derivatives do not cancel, with c for d/dt."""
-        combination = self.outline.combination
+        combination = self.structure.combination
         return combination.of([rows * c**k if k else rows for k in range(combination.degree + 1)])[0]
 
     def rates(self, t: Any, y: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -165,7 +165,7 @@ class Pencil(eqx.Module):
 
         return jax.lax.fori_loop(0, GAUSS_NEWTON, improve, self.form.known_rates(y))
 
-    def starting(self, t: Any, y: Float[Array, " n"]) -> "Pencil":
+    def starting(self, t: Any, y: Float[Array, " n"]) -> "LinearisedResidual":
         """For a solve from (t, y)."""
         return dataclasses.replace(self, start=jax.lax.stop_gradient(self.rates(t, y)))
 
@@ -176,7 +176,7 @@ class Pencil(eqx.Module):
         Source: E. Hairer, G. Wanner, *Solving Ordinary Differential Equations II*, VII.3 and the program RADAU5.
         """
         size = jnp.minimum(jnp.abs(h), 1)
-        indices = np.array(self.outline.indices)
+        indices = np.array(self.structure.indices)
         weights = powers(size, tuple(np.maximum(indices - 1, 0).tolist()))
         seen = self._followed
         return weights * jnp.where(seen, jnp.clip(raised, 1, 1 / size), 1) if seen.any() else weights
@@ -190,11 +190,11 @@ class Pencil(eqx.Module):
     @property
     def _followed(self) -> Bool[np.ndarray, " n"]:
         """Which of the user's variables of index 2 and higher are controlled by themselves."""
-        return self.form.independent & (np.array(self.outline.indices) > 1)
+        return self.form.independent & (np.array(self.structure.indices) > 1)
 
     def counted(self, dense: bool) -> Bool[np.ndarray, " n"]:
         """Which variables are of index 0 or 1, or seen by the user where values between steps are wanted."""
-        return (np.array(self.outline.indices) <= 1) | (dense & self.form.shown)
+        return (np.array(self.structure.indices) <= 1) | (dense & self.form.shown)
 
 
 def powers(x: Float[Array, ""], exponents: tuple[int, ...]) -> Float[Array, " n"]:
@@ -217,12 +217,12 @@ def _outline(
     offsets: tuple[int, ...],
     hidden: bool,
     combination: Combination,
-) -> Outline:
+) -> JacobianStructure:
     n = len(indices)
     by_y, by_rate = (np.frombuffer(x, bool).reshape(n, n) for x in (on_y, on_rate))
     storage = _storage(by_y | by_rate, highest_value_transversal(signature(by_y, by_rate)))
     small = n <= LOOPED
-    return Outline(
+    return JacobianStructure(
         storage,
         indices,
         offsets,

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from ..linalg import take
 from ..systems import System
-from .linearised import Pencil
+from .linearised import LinearisedResidual
 from .residual_form import ResidualForm
 from .structural_ode import StructuralODE
 
@@ -33,9 +33,9 @@ def equation_drift(system: System, t: Any, state: Any, args: Any) -> tuple[Float
     form = ResidualForm.of(system, t, state, args)
     y = form.encode(state)
     t = jnp.asarray(t, y.dtype)
-    pencil = Pencil.of(form, y)
-    if not pencil.outline.hidden:
-        return (jnp.max(jnp.abs(pencil.residual(t, y, pencil.rates(t, y)))),)
+    linearised = LinearisedResidual.of(form, y)
+    if not linearised.structure.hidden:
+        return (jnp.max(jnp.abs(linearised.residual(t, y, linearised.rates(t, y)))),)
     ode = StructuralODE.of(form, y.dtype, complete=True)
     return tuple(jnp.max(jnp.abs(level)) for level in ode.invariants(t, _with_derivatives(ode, t, y)))
 

@@ -6,8 +6,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ..equations.index1_form import ReducedForm
-from ..equations.linearised import Pencil
+from ..equations.index1_form import Index1Form
+from ..equations.linearised import LinearisedResidual
 from ..equations.residual_form import ResidualForm
 from ..equations.structural_ode import StructuralODE
 from .interface import AbstractFieldFormulation, AbstractResidualFormulation
@@ -45,7 +45,7 @@ class DummyDerivatives(AbstractFieldFormulation):
 
 
 class ReducedResidual(AbstractResidualFormulation):
-    """The equations of `DummyDerivatives` for a solver of residuals: see `ReducedForm`."""
+    """The equations of `DummyDerivatives` for a solver of residuals: see `Index1Form`."""
 
     inverts_mass: ClassVar[bool] = False
 
@@ -57,10 +57,10 @@ class ReducedResidual(AbstractResidualFormulation):
     def keeps(self) -> tuple[bool, bool]:
         return True, True
 
-    def encode(self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None) -> tuple[Any, Pencil]:
+    def encode(self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None) -> tuple[Any, LinearisedResidual]:
         y, ode = DummyDerivatives().encode(system, t, state, args, rank)
-        form = ReducedForm(ode, ode.selection(t, y, None)[0])
+        form = Index1Form(ode, ode.selection(t, y, None)[0])
         z = form.encode(t, y)
         # The selection changes: the structure is that of all of them.
-        pencil = Pencil.of(form.with_all_candidates(y.dtype), z)
-        return z, eqx.tree_at(lambda p: p.form, pencil, form).starting(t, z)
+        linearised = LinearisedResidual.of(form.with_all_candidates(y.dtype), z)
+        return z, eqx.tree_at(lambda p: p.form, linearised, form).starting(t, z)

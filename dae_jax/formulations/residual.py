@@ -4,7 +4,7 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 
-from ..equations.linearised import Pencil
+from ..equations.linearised import LinearisedResidual
 from ..equations.residual_form import Form, ResidualForm
 from .interface import AbstractResidualFormulation
 
@@ -34,7 +34,7 @@ class Residual(AbstractResidualFormulation):
     def keeps(self) -> tuple[bool, bool]:
         return self.form != "index-2", self.form != "index-3"
 
-    def encode(self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None) -> tuple[Any, Pencil]:
+    def encode(self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None) -> tuple[Any, LinearisedResidual]:
         form = ResidualForm.of(system, t, state, args, self.form)
         if self.variable_index is not None and len(self.variable_index) != form.size:
             raise ValueError(
@@ -48,8 +48,8 @@ class Residual(AbstractResidualFormulation):
                 "underlying ODE such as OrthogonalProjection, for which `rank=` says how many are independent."
             )
         form, y = form.at_start(t, state)
-        pencil = Pencil.of(form, y, self.variable_index)
-        return y, pencil.starting(t, y)
+        linearised = LinearisedResidual.of(form, y, self.variable_index)
+        return y, linearised.starting(t, y)
 
 
 def GGL() -> Residual:

@@ -14,7 +14,7 @@ from .manifold import time_sign
 from .residual_steps import (
     AbstractResidualSolver,
     Tolerances,
-    at_the_floor,
+    at_min_step,
     constant,
     corrected,
     goes_on,
@@ -89,7 +89,7 @@ class _State(NamedTuple):
 class _Step(NamedTuple):
     """The equation of a step, 0 = F(t₁, y, ẏ*+ c (y − y*)): a pytree, so that it can be differentiated."""
 
-    pencil: Any
+    linearised: Any
     sign: Any
     t1: Any
     h: Any
@@ -99,12 +99,12 @@ class _Step(NamedTuple):
 
     def residual(self, y: Float[Array, " n"]) -> Float[Array, " n"]:
         """F at the new point."""
-        return self.pencil.residual(self.sign * self.t1, y, self.sign * (self.rate + self.c * (y - self.y)))
+        return self.linearised.residual(self.sign * self.t1, y, self.sign * (self.rate + self.c * (y - self.y)))
 
     def factor(self, y: Float[Array, " n"]) -> tuple[Any, Float[Array, ""]]:
         """The factors of ∂F/∂y + c ∂F/∂ẏ, and the smallest pivot."""
-        j, m = self.pencil.jacobians(self.sign * self.t1, y, self.sign * (self.rate + self.c * (y - self.y)))
-        return self.pencil.factor(j, m, self.sign * self.c, self.h)
+        j, m = self.linearised.jacobians(self.sign * self.t1, y, self.sign * (self.rate + self.c * (y - self.y)))
+        return self.linearised.factor(j, m, self.sign * self.c, self.h)
 
 
 class BDF(AbstractResidualSolver):
@@ -155,7 +155,7 @@ class BDF(AbstractResidualSolver):
         factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda: like.factor(y0)[0]))
         return _start(sign * args.start, factors)
 
-    def forget(self, state: _State) -> _State:
+    def invalidate_jacobian(self, state: _State) -> _State:
         return state._replace(c=jnp.zeros_like(state.c))
 
     def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: _State, made_jump: Any) -> Any:
@@ -176,7 +176,7 @@ class BDF(AbstractResidualSolver):
             lambda params: _solve(*params),
             (_Step(args, sign, t1, h, method.c, y, rate), *constant((y0, state, is_smallest(t0, t1))), tol),
             linear_solve=lambda inverse, b: inverse(b),
-            jacobian=lambda y, params: functools.partial(params[0].pencil.solve, params[0].factor(y)[0]),
+            jacobian=lambda y, params: functools.partial(params[0].linearised.solve, params[0].factor(y)[0]),
         )
         # Row j of the new differences is the change and all rows from j to k; rows above k are not used yet, or are φₖ₊₁.
         phi = [y1 - y]
@@ -192,12 +192,12 @@ class BDF(AbstractResidualSolver):
         held = (h < LESS * state.wanted) | (state.held & (alike <= k + 1))
         decision = _decision(constant(method), state, alike, held, size(change), sizes, higher)
         # What is algebraic may jump, and the history with it.
-        smooth = method.tail * size(change * args.outline.differential) < 1
+        smooth = method.tail * size(change * args.structure.differential) < 1
         jumped = constant(is_smallest(t0, t1) & newton.converged & (passes | (decision.factor < SAFETY)) & smooth)
         error = (jnp.where(jumped, 2, decision.factor) / SAFETY) ** -ERROR_ORDER
         failure = of_step(newton.converged, pivot, y0.size, error)
         error = jnp.where(newton.converged, error, jnp.inf) * tol.scale(y0, y1)
-        y1, error, result = at_the_floor(failure, t0, t1, y0, y1, constant(error))
+        y1, error, result = at_min_step(failure, t0, t1, y0, y1, constant(error))
         phi = jnp.stack(phi)
         new = _State(
             phi[1:], method.psi, state.steps + 1, decision.order, k, alike, decision.rising, decision.factor * h,
@@ -262,7 +262,7 @@ def _solve(step: _Step, y0: Any, state: _State, smallest: Any, tol: Tolerances) 
     """y at t₁, and how it was found: with the factors at hand first, with new ones where these fail, and in the smallest
     step with new ones for each correction.
     """
-    weights, differential = step.pencil.weights(step.h), step.pencil.outline.differential
+    weights, differential = step.linearised.weights(step.h), step.linearised.structure.differential
     changed = jnp.abs(step.c - state.c) > ALIKE * step.c
 
     def attempt(carry: Any) -> Any:
@@ -270,7 +270,7 @@ def _solve(step: _Step, y0: Any, state: _State, smallest: Any, tol: Tolerances) 
         renew = (tries > 0) | changed
         start = start_of(tries, step.y, before.x)
         factors, pivot = lax.cond(renew, lambda: step.factor(start), lambda: (factors, jnp.full_like(step.c, jnp.inf)))
-        correction = lambda y: -step.pencil.solve(factors, step.residual(y))
+        correction = lambda y: -step.linearised.solve(factors, step.residual(y))
         scale = lambda y: weights / tol.scale(y0, y)
         eta = jnp.where(renew, 1, state.eta)
         newton = lax.cond(

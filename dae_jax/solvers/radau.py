@@ -28,7 +28,7 @@ from .radau_coefficients import (
 from .residual_steps import (
     AbstractResidualSolver,
     Tolerances,
-    at_the_floor,
+    at_min_step,
     constant,
     corrected,
     goes_on,
@@ -98,7 +98,7 @@ class _Step(NamedTuple):
     jumps, equations of both sides of the jump need have no solution together, those of one side have.
     """
 
-    pencil: Any
+    linearised: Any
     sign: Any
     t0: Any
     t1: Any
@@ -136,18 +136,18 @@ class _Step(NamedTuple):
 
     def residuals(self, z: Float[Array, "3 n"]) -> list[Float[Array, " n"]]:
         """F at the stages."""
-        return self.at_stages(self.pencil.residual, z)
+        return self.at_stages(self.linearised.residual, z)
 
     def jacobians(self, t: Any, y: Any, yd: Any) -> tuple[Any, Any]:
         """∂F/∂y and ∂F/∂(dy/dτ) for the loop's own time τ = ± t."""
-        j, m = self.pencil.jacobians(t, y, yd)
+        j, m = self.linearised.jacobians(t, y, yd)
         return j, self.sign * m
 
     def factor(self, jacobians: Any) -> tuple[Any, Float[Array, ""]]:
         """The factors of γ/h M + J, in the smallest step of M/h + J, and of (α + iβ)/h M + J, and the smallest pivot."""
         j, m = jacobians
-        real, pivot = self.pencil.factor(j, m, jnp.where(self.smallest, 1, GAMMA) / self.h, self.h)
-        both, other = self.pencil.factor(j, m, lax.complex(ALPHA / self.h, BETA / self.h), self.h)
+        real, pivot = self.linearised.factor(j, m, jnp.where(self.smallest, 1, GAMMA) / self.h, self.h)
+        both, other = self.linearised.factor(j, m, lax.complex(ALPHA / self.h, BETA / self.h), self.h)
         return (real, both), jnp.minimum(pivot, other)
 
     def correction(self, factors: Any, z: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
@@ -155,8 +155,8 @@ class _Step(NamedTuple):
         real, both = factors
         residuals = self.residuals(z)
         first, second, third = _combined(BACK, residuals)
-        w = self.pencil.solve(real, jnp.where(self.smallest, residuals[2], first))
-        v = self.pencil.solve(both, lax.complex(second, third))
+        w = self.linearised.solve(real, jnp.where(self.smallest, residuals[2], first))
+        v = self.linearised.solve(both, lax.complex(second, third))
         stages = _combined(TRANSFORM, [w, jnp.real(v), jnp.imag(v)])
         return -jnp.stack([jnp.where(self.smallest, w, stage) for stage in stages])
 
@@ -214,7 +214,7 @@ class RadauIIA5(AbstractResidualSolver):
             jnp.zeros((3, y0.size), y0.dtype), zero, args.start, jacobians, factors, zero, jnp.asarray(True), zero + 1
         )
 
-    def forget(self, state: _State) -> _State:
+    def invalidate_jacobian(self, state: _State) -> _State:
         return state._replace(refresh=jnp.ones_like(state.refresh))
 
     def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: _State, made_jump: Any) -> Any:
@@ -241,10 +241,10 @@ class RadauIIA5(AbstractResidualSolver):
             counted = jnp.where(jnp.abs(between) > jnp.abs(scaled), between, scaled)
         rates, smallest = step.stages(z)[2][2], step.smallest
         # What is algebraic may jump in the smallest step.
-        bend = constant((rates - state.rates) * (step.h / 2)) * args.outline.differential
+        bend = constant((rates - state.rates) * (step.h / 2)) * args.structure.differential
         scaled = jnp.where(smallest, bend, counted)
         failure = of_step(newton.converged, pivot, y0.size, tol.norm(scaled, y0, y1))
-        y1, scaled, result = at_the_floor(failure, t0, t1, y0, y1, scaled)
+        y1, scaled, result = at_min_step(failure, t0, t1, y0, y1, scaled)
         slow = (newton.theta > FAST) & (newton.count > 1)
         # What jumped says nothing of the next step.
         size = jnp.where(smallest, 0, step.h)
@@ -267,7 +267,7 @@ def _solve(step: _Step, state: _State, tol: Tolerances) -> Any:
     """
     h, smallest = step.h, step.smallest
     predicted = jnp.where(smallest, 0, _predicted(state, h))
-    weights, differential = step.pencil.weights(h, tol.raised()), step.pencil.outline.differential
+    weights, differential = step.linearised.weights(h, tol.raised()), step.linearised.structure.differential
 
     def attempt(carry: Any) -> Any:
         tries, fresh, before, jacobians, factors, _ = carry
@@ -312,8 +312,8 @@ def _error(step: _Step, factor: Any, z: Any, tol: Tolerances) -> Float[Array, " 
 
     def estimate(carry: Any) -> Any:
         count, error, _ = carry
-        error = -step.pencil.solve(factor, step.pencil.residual(step.sign * step.t0, step.y0 + error, rate))
-        return count + 1, error, tol.norm(error * step.pencil.weights(step.h), step.y0, step.y0 + z[2])
+        error = -step.linearised.solve(factor, step.linearised.residual(step.sign * step.t0, step.y0 + error, rate))
+        return count + 1, error, tol.norm(error * step.linearised.weights(step.h), step.y0, step.y0 + z[2])
 
     return lax.while_loop(again, estimate, (0, jnp.zeros_like(step.y0), jnp.zeros_like(step.h)))[1]
 
@@ -331,10 +331,10 @@ def _between(state: _State, h: Any, z: Any) -> Float[Array, " n"]:
 def _coupled(step: _Step, z: Float[Array, "3 n"]) -> Any:
     """The Jacobian of all stages at the solution, in the storage of their unknowns interleaved."""
     found = step.at_stages(step.jacobians, z)
-    storage, matrix = step.pencil.storage.coupled(
+    storage, matrix = step.linearised.storage.coupled(
         [j for j, _ in found], [m for _, m in found], step.rates / step.h
     )
-    return storage, matrix, jnp.repeat(step.pencil.column_scale(step.h), 3)
+    return storage, matrix, jnp.repeat(step.linearised.column_scale(step.h), 3)
 
 
 def _linear_solve(jacobian: Any, b: Float[Array, " 3n"]) -> Float[Array, " 3n"]:

@@ -26,7 +26,7 @@ DAMPED, WHOLE = 40, 6
 
 
 class AbstractResidualSolver(diffrax.AbstractAdaptiveSolver):
-    """A solver of 0 = F(t, y, ẏ); needs a `Pencil` as `args`, one that is `starting`.
+    """A solver of 0 = F(t, y, ẏ); needs a `LinearisedResidual` as `args`, one that is `starting`.
 
     `rtol`, `atol`: the tolerances that Newton's method is fitted to; by default those of the step-size controller, and
     round-off for fixed steps.
@@ -47,7 +47,7 @@ class AbstractResidualSolver(diffrax.AbstractAdaptiveSolver):
         return terms.vf(t0, y0, args)
 
     @abc.abstractmethod
-    def forget(self, state: Any) -> Any:
+    def invalidate_jacobian(self, state: Any) -> Any:
         """The solver's state without its iteration matrix, for equations that are others now for the same unknowns."""
 
 
@@ -227,7 +227,7 @@ def is_smallest(t0: Any, t1: Any) -> Bool[Array, ""]:
     return t1 - t0 <= jnp.maximum(resolution, jnp.finfo(t0.dtype).tiny ** 0.75)
 
 
-def at_the_floor(failure: Failure, t0: Any, t1: Any, y0: Any, y1: Any, error: Any) -> tuple[Any, Any, diffrax.RESULTS]:
+def at_min_step(failure: Failure, t0: Any, t1: Any, y0: Any, y1: Any, error: Any) -> tuple[Any, Any, diffrax.RESULTS]:
     """(y₁, error, result) of a step. One that came to nothing has an infinite error, so that a smaller one is tried; where
     time resolves no smaller one, the error is 0, y₁ = y₀, and the result tells an adaptive solve why it ends here.
     """

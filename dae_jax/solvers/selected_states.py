@@ -43,7 +43,7 @@ class SelectedStates(AbstractChartSolver):
 
 
 class SelectedResiduals(AbstractResidualSolver):
-    """A step of a solver of residuals on a `ReducedForm`, in which the entries that are not integrated are algebraic
+    """A step of a solver of residuals on an `Index1Form`, in which the entries that are not integrated are algebraic
     variables. The unknowns are the same whatever is selected, so that a multistep method keeps its history. Used by
     `DummyDerivatives`, which see.
     """
@@ -67,14 +67,14 @@ class SelectedResiduals(AbstractResidualSolver):
     def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Selection:
         return Selection(self.solver.init(terms, t0, t1, y0, args), constant(args.form.directions), jnp.asarray(0))
 
-    def forget(self, state: Selection) -> Selection:
-        return state._replace(inner=self.solver.forget(state.inner))
+    def invalidate_jacobian(self, state: Selection) -> Selection:
+        return state._replace(inner=self.solver.invalidate_jacobian(state.inner))
 
     def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Selection, made_jump: Any) -> Any:
         ode = args.form.ode
         directions, switched = ode.selection(time_sign(terms, t0, t1) * t0, y0[: ode.orders.size], solver_state.directions)
         solver = dataclasses.replace(self.solver, rtol=self.rtol, atol=self.atol)
-        pencil = eqx.tree_at(lambda p: p.form.directions, args, directions)
-        state = jax.tree.map(lambda a, b: jnp.where(switched, a, b), self.forget(solver_state), solver_state)
-        *step, inner, result = solver.step(terms, t0, t1, y0, pencil, state.inner, made_jump)
+        linearised = eqx.tree_at(lambda p: p.form.directions, args, directions)
+        state = jax.tree.map(lambda a, b: jnp.where(switched, a, b), self.invalidate_jacobian(solver_state), solver_state)
+        *step, inner, result = solver.step(terms, t0, t1, y0, linearised, state.inner, made_jump)
         return *step, Selection(inner, directions, solver_state.switches + switched), result
