@@ -80,7 +80,8 @@ class TestTargets:
         except RuntimeError:
             pytest.skip(f"LLVM was built without {triple}")
         from dae_jax.compiler.emit import vector_math
-        from dae_jax.compiler.lower import instructions, module
+        from dae_jax.compiler.lower import annotated, estimate, instructions, module
+        from dae_jax.compiler.lower.rules import floats
 
         asked = set()
 
@@ -91,8 +92,9 @@ class TestTargets:
             return True
 
         monkeypatch.setattr(vector_math, "host", lambda: other)
-        monkeypatch.setattr(instructions, "vector_size", lambda: other.width)
-        monkeypatch.setattr(instructions, "has_symbol", looked_up)
+        for user in (annotated, estimate, instructions):
+            monkeypatch.setattr(user, "vector_size", lambda: other.width)
+        monkeypatch.setattr(floats, "has_symbol", looked_up)
         monkeypatch.setattr(runtime, "has_symbol", looked_up)
         table = lambda x: (jnp.arange(400.0) * x[0]).at[3].set(jnp.cbrt(x[1]))
         jaxpr = jax.make_jaxpr(lambda x: (slow(x), jnp.power(x[0], x[1]), table(x)))(X)
