@@ -122,6 +122,9 @@ def _bind(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Sequence[Any]) -> l
 
 @kernel_p.def_impl
 def _(*args: Any, **params: Any) -> Any:
+    # JAX looks for what is not a number by calling a function without compiling it, again where that compiles.
+    if jax.config.jax_disable_jit or jax.config.jax_debug_nans or jax.config.jax_debug_infs:
+        return _plain(*args, **params)
     return jax.jit(lambda *xs: kernel_p.bind(*xs, **params))(*args)
 
 

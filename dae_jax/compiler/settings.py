@@ -42,8 +42,8 @@ def current() -> Settings:
 
 
 def one_kernel_enabled() -> bool:
-    """Whether solves that are traced now may become one kernel."""
-    return current().compiler != "off"
+    """Whether solves that are traced now may become one kernel; what JAX is told not to compile does not."""
+    return current().compiler != "off" and not jax.config.jax_disable_jit
 
 
 def processors() -> int:

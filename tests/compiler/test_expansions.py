@@ -61,6 +61,25 @@ def test_full_qr():
     assert_expanded(lambda a: jnp.linalg.qr(a, mode="complete"), matrix(3, 5))
 
 
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("mode", ["reduced", "complete"])
+def test_qr_where_squares_overflow_or_are_zero(dtype, mode):
+    a = matrix(5, 3, dtype=dtype)
+    limits = np.finfo(dtype)
+    for size in (limits.tiny**0.9, limits.max**0.9):
+        q, r = jit(lambda a: jnp.linalg.qr(a, mode=mode))(a * size)
+        np.testing.assert_allclose(q @ (r / size), a, atol=100 * limits.eps)
+        np.testing.assert_allclose(q.conj().T @ q, np.eye(q.shape[1]), atol=100 * limits.eps)
+
+
+@pytest.mark.parametrize("fn", [jnp.linalg.cholesky, jnp.linalg.qr, jnp.linalg.inv, jax.lax.linalg.lu, jnp.sort, jnp.argsort])
+@pytest.mark.parametrize("transform", [lambda fn: fn, jax.vmap])
+def test_no_entries(fn, transform):
+    a = np.zeros((2, 0, 0))
+    for x, y in zip(jax.tree.leaves(transform(jit(fn))(a)), jax.tree.leaves(transform(jax.jit(fn))(a)), strict=True):
+        assert (x.shape, x.dtype) == (y.shape, y.dtype)
+
+
 @pytest.mark.parametrize("n", [3, 8])
 def test_singular_and_indefinite(n):
     singular = np.ones((n, n))

@@ -298,3 +298,18 @@ class TestErrors:
         solve = lambda throw: jit(lambda y0: solution(y0, 9.81, oscillator, diffrax.Tsit5(), max_steps=4, throw=throw))
         self.fails(solve(True), PENDULUM[1], match="maximum number of solver steps")
         assert solve(False)(PENDULUM[1]).result == diffrax.RESULTS.max_steps_reached
+
+
+class TestWhatJaxIsToldForDebugging:
+    @pytest.mark.parametrize("fn", [jnp.log, jax.grad(jnp.sqrt), lambda x: jax.lax.fori_loop(0, 3, lambda i, x: jnp.log(x), x)])
+    def test_what_is_not_a_number_raises(self, fn):
+        with jax.debug_nans(True), pytest.raises(FloatingPointError, match="nan"):
+            jit(fn)(-1.0)
+
+    def test_nothing_is_compiled(self):
+        def fn(x):
+            # What is known while it runs may decide.
+            return jax.lax.fori_loop(0, 5, lambda i, x: x * 2 if x > 1 else x + 1, x)
+
+        with jax.disable_jit():
+            assert jit(fn)(0.5) == fn(0.5) == 24.0

@@ -178,6 +178,17 @@ def test_many_complex_numbers():
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_complex_numbers_by_zero(dtype):
+    def quotient(a, b, c, d):
+        z = LAX.complex(a, b) / LAX.complex(c, d)
+        return [jnp.real(z), jnp.imag(z)]
+
+    sizes = np.meshgrid([1.0, -2.0, 0.0], [3.0, -1.0, 0.0], [0.0, -0.0], [0.0, -0.0])
+    numbers = np.stack([x.reshape(9, 4) for x in sizes]).astype(dtype)
+    same(quotient, *numbers)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_special_functions(dtype):
     def fn(x, y):
         inside = [z / 4 for z in (x, y)]

@@ -45,12 +45,15 @@ def multiplied(code: Instructions, kind: str, x: Any, y: Any) -> Complex:
 
 
 def divided(code: Instructions, kind: str, x: Any, y: Any) -> Complex:
-    """By Smith's algorithm: no overflow in c² + d²."""
+    """By Smith's algorithm: no overflow in c² + d². What is not 0 is infinite by 0."""
     (a, b), (c, d) = parts(x), parts(y)
     absolute = lambda u: code.intrinsic("fabs", kind, u)
     wide = code.op("fcmp oge", kind, absolute(c), absolute(d), result="i1")
     big, small = code.select(wide, c, d, kind), code.select(wide, d, c, kind)
     ratio = code.op("fdiv", kind, small, big)
+    # The sign of a zero shows in the sum below.
+    zero = code.op("fcmp oeq", kind, big, 0.0, result="i1")
+    ratio = code.select(zero, code.op("fneg", kind, small), ratio, kind)
     times = lambda u, v: code.op("fmul", kind, u, v)
     bottom = code.op("fadd", kind, big, times(small, ratio))
     u, v = code.select(wide, a, b, kind), code.select(wide, b, a, kind)

@@ -11,7 +11,9 @@ from ..scalar_interpreter import Unsupported
 
 
 def refuse_large(name: str, *sizes: int) -> None:
-    """Raises `Unsupported` for matrices that are LAPACK's."""
+    """Raises `Unsupported` for matrices that are LAPACK's, and for those without entries."""
+    if not min(sizes):
+        raise Unsupported(f"{name} of an empty matrix")
     if max(sizes) > THRESHOLDS.largest_matrix:
         raise Unsupported(f"{name} of more than {THRESHOLDS.largest_matrix} rows or columns")
 
@@ -30,8 +32,6 @@ def lu(a: Any, **_: Any) -> tuple[Any, Any, Any]:
     """
     m, n = a.shape[-2:]
     refuse_large("lu", m, n)
-    if not m * n:
-        raise Unsupported("lu of an empty matrix")
     return of_batch(_lu_written_out if max(m, n) <= THRESHOLDS.matrix_written_out else _lu_in_loop, a.ndim - 2)(a)
 
 

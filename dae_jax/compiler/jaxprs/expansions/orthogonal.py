@@ -33,10 +33,13 @@ def _reflected(a: Any) -> tuple[Any, Any]:
     def reflect(k: Any, carry: Any) -> Any:
         a, taus = carry
         alpha, below = a[k, k], jnp.where(row > k, a[:, k], 0)
-        length = jnp.sqrt(jnp.sum(_square(below)) + _square(alpha))
+        # Squares of the entries as they are may overflow, or be 0.
+        largest = jnp.maximum(jnp.max(jnp.abs(below)), jnp.abs(alpha))
+        unit = jnp.where(largest > 0, largest, 1)
+        length = unit * jnp.sqrt(jnp.sum(_square(below / unit)) + _square(alpha / unit))
         beta = jnp.where(alpha.real >= 0, -length, length)
         # Nothing is reflected that points along the first axis already.
-        still = (jnp.sum(_square(below)) == 0) & (alpha.imag == 0 if jnp.iscomplexobj(a) else True)
+        still = jnp.all(below == 0) & (alpha.imag == 0 if jnp.iscomplexobj(a) else True)
         tau = jnp.where(still, 0, (beta - alpha) / jnp.where(still, 1, beta))
         v = jnp.where(row == k, 1, below / jnp.where(still, 1, alpha - beta))
         a_after = a - jnp.conj(tau) * v[:, None] * (v.conj() @ a)

@@ -15,6 +15,8 @@ def sort(*operands: Any, dimension: int, num_keys: int, **_: Any) -> list[Any]:
     n = operands[0].shape[dimension]
     if n > THRESHOLDS.longest_sort:
         raise Unsupported(f"sort of more than {THRESHOLDS.longest_sort} entries")
+    if n < 2:
+        return list(operands)
     last = [jnp.moveaxis(x, dimension, -1) for x in operands]
 
     def in_order(*xs: Any) -> list[Any]:
