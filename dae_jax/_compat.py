@@ -7,16 +7,11 @@ from typing import Any
 
 from diffrax._root_finder import use_stepsize_tol as use_stepsize_tol
 from equinox.internal import unvmap_any as unvmap_any, while_loop as while_loop
-from jax._src.core import trace_state_clean
+from jax._src.core import trace_state_clean as trace_state_clean
 
 
 # Whose log has the traceback of an error that a callback raised, before JAX raises its own.
 CALLBACK_LOG = "jax._src.callback"
-
-
-def trace_state_is_clean() -> bool:
-    """Whether nothing is being traced in this thread."""
-    return trace_state_clean()
 
 
 def messages(enumeration: Any) -> list[str]:

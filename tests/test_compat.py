@@ -40,9 +40,9 @@ class TestPackage:
             assert jax.grad(loop)(2.0) == 192.0
 
     def test_nothing_is_traced_here(self):
-        assert _compat.trace_state_is_clean()
+        assert _compat.trace_state_clean()
         seen = []
-        jax.jit(lambda x: seen.append(_compat.trace_state_is_clean()) or x)(1.0)
+        jax.jit(lambda x: seen.append(_compat.trace_state_clean()) or x)(1.0)
         assert seen == [False]
 
     def test_messages_of_results(self):

@@ -7,7 +7,12 @@ from .jaxprs.numbers import on_numbers as on_numbers
 from .jaxprs.polynomials import Polynomial as Polynomial, polynomials as polynomials
 from .jaxprs.scalarise import scalarise as scalarise
 from .jaxprs.unchecked import without_checks as without_checks
-from .jaxprs.walk import equations as equations, is_large as is_large
+from .jaxprs.walk import (
+    ALL_CALLS as ALL_CALLS,
+    called as called,
+    equations as equations,
+    is_large as is_large,
+)
 from .jit import Jitted as Jitted, jit as jit
 from .kernel_call import Decision as Decision, decision as decision, hindrances as hindrances
 from .one_kernel import (

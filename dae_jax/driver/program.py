@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .._compat import trace_state_is_clean
+from .._compat import trace_state_clean
 from ..compiler import PullBack, inexact, one_kernel, waiting
 from ..consistent import look_at_end, look_at_start
 from ..equations.regularity import COARSE
@@ -33,7 +33,7 @@ _traced: list[Program] = []
 
 def _make_room() -> None:
     """JAX and equinox keep the traces of thousands of problems: after so many new ones they are told to forget them."""
-    if len(_traced) >= KEPT and trace_state_is_clean():
+    if len(_traced) >= KEPT and trace_state_clean():
         _traced.clear()
         jax.clear_caches()
 

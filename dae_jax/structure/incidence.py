@@ -19,6 +19,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 from jaxtyping import Float
 
+from ..compiler import ALL_CALLS, called
 from . import (
     incidence_contractions as contractions,
     incidence_control as control,
@@ -66,19 +67,7 @@ CONTROL: Mapping[str, Callable[[Any, list[Cells], control.Run], list[Cells]]] = 
 }
 
 # Primitives that evaluate another jaxpr, and the parameter that holds it.
-CALLS = {
-    "call": "call_jaxpr",
-    "checkpoint": "jaxpr",
-    "closed_call": "call_jaxpr",
-    "composite": "jaxpr",
-    "core_call": "call_jaxpr",
-    "custom_jvp_call": "call_jaxpr",
-    "custom_vjp_call": "call_jaxpr",
-    "custom_vmap_call": "call",
-    "jit": "jaxpr",
-    "pjit": "jaxpr",
-    "remat2": "jaxpr",
-}
+CALLS = {**ALL_CALLS, "call": "call_jaxpr", "composite": "jaxpr", "core_call": "call_jaxpr"}
 
 # Cheap on numbers by their own rule; everything else is evaluated as a whole where all its operands are known.
 _CHEAP = frozenset({*entries.ELEMENTWISE, *entries.MOVEMENT, *entries.IDENTITY, *CALLS}) | {
@@ -157,9 +146,9 @@ def _run_eqn(eqn: Any, inputs: list[Cells], derivative: bool) -> list[Cells]:
         numbers = evaluate(eqn, [cells.value for cells in inputs])
         return [_constant(number, out.aval) for number, out in zip(numbers, eqn.outvars, strict=True)]
     run = functools.partial(_run, derivative=derivative)
-    if name in CALLS:
-        inner = eqn.params[CALLS[name]]
-        outputs = run(inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ()), inputs)
+    inner = called(eqn, CALLS)
+    if inner is not None:
+        outputs = run(inner, inputs)
     elif name in CONTROL:
         outputs = CONTROL[name](eqn, inputs, run)
     elif name == "sort":

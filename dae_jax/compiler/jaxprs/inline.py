@@ -7,11 +7,10 @@ import jax
 import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
 
-from .scalar_interpreter import CALLS as OF_CALLS
 from .special_functions import SPECIAL, by_simpler_ones
+from .walk import called, of_solve
 
 
-CALLS = {**OF_CALLS, "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "custom_vmap_call": "call"}
 # They give their first operand, or what is said here; others of equinox mean something to transformations only.
 _GIVES = {
     **dict.fromkeys(
@@ -57,9 +56,9 @@ class _Flat:
 
     def _equation(self, eqn: JaxprEqn, args: list[Any]) -> list[Any]:
         name, p = eqn.primitive.name, eqn.params
-        if name in CALLS:
-            inner = p[CALLS[name]]
-            return self.run(inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ()), args)
+        inner = called(eqn)
+        if inner is not None:
+            return self.run(inner, args)
         if name in _GIVES:
             return [args[_GIVES[name]]]
         if name in SPECIAL:
@@ -80,12 +79,6 @@ class _Flat:
             found = self._known[key] = [Var(v.aval) for v in eqn.outvars]
             self.eqns.append(eqn.replace(invars=args, outvars=found))
         return found
-
-
-def of_solve(p: Any, args: list[Any]) -> list[Any]:
-    """The operands of a `custom_linear_solve` that the function which finds the solution takes."""
-    start, count = sum(p["const_lengths"][:2]), p["const_lengths"].solve
-    return args[start : start + count] + args[sum(p["const_lengths"]) :]
 
 
 def _until_all_are_done(eqn: JaxprEqn, args: list[Any]) -> tuple[JaxprEqn, list[Any]]:

@@ -6,11 +6,11 @@ from typing import Any
 import jax
 from jax.extend.core import ClosedJaxpr, Literal
 
-from .scalar_interpreter import CALLS as OF_CALLS, Unsupported
-from .walk import equations, equations_in
+from .scalar_interpreter import Unsupported
+from .walk import CALLS, WITH_DERIVATIVE, called, equations, equations_in, of_solve
 
 
-CALLS = {**OF_CALLS, "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr"}
+_CALLS = {**CALLS, **WITH_DERIVATIVE}
 
 
 class Rewriting:
@@ -48,10 +48,9 @@ class Rewriting:
         if not any(map(self._applies, equations_in(eqn))):
             results = eqn.primitive.bind(*args, **eqn.primitive.get_bind_params(p))
             return results if eqn.primitive.multiple_results else [results], state
-        if name in CALLS:
-            inner = p[CALLS[name]]
-            jaxpr, consts = (inner.jaxpr, inner.consts) if isinstance(inner, ClosedJaxpr) else (inner, ())
-            return self.run(jaxpr, consts, args, state)
+        inner = called(eqn, _CALLS)
+        if inner is not None:
+            return self.run(inner.jaxpr, inner.consts, args, state)
         match name:
             case "cond":
                 which, *operands = args
@@ -101,12 +100,6 @@ class Rewriting:
             turn, (args[n : n + k], state), args[n + k :], p["length"], p["reverse"], p["unroll"]
         )
         return [*carry, *ys], state
-
-
-def of_solve(p: Any, args: list[Any]) -> list[Any]:
-    """The operands of a `custom_linear_solve` that the function which finds the solution takes."""
-    start, count = sum(p["const_lengths"][:2]), p["const_lengths"].solve
-    return args[start : start + count] + args[sum(p["const_lengths"]) :]
 
 
 def _parted(found: Sequence[Any], n: int) -> tuple[list[Any], list[Any]]:

@@ -17,6 +17,7 @@ from jax.extend.core import ClosedJaxpr, Literal
 from .movement import MOVEMENTS, dynamic_slice, gather, scatter
 from .numbers import converted, on_numbers
 from .objects import are_known, columns, is_number, objects
+from .walk import CALLS, WITH_DERIVATIVE, called
 
 
 ELEMENTWISE = frozenset(
@@ -26,15 +27,6 @@ ELEMENTWISE = frozenset(
 )
 _AT_PLACES = frozenset({"dynamic_slice", "gather", "scatter", "scatter-add"})
 _COMBINING = frozenset({"add_any", "dot_general", "reduce_max", "reduce_sum"})
-CALLS = {
-    "closed_call": "call_jaxpr",
-    "jit": "jaxpr",
-    "pjit": "jaxpr",
-    "remat2": "jaxpr",
-    "checkpoint": "jaxpr",
-}
-# They have a derivative of their own, which their arithmetic has not.
-_OPAQUE = frozenset({"custom_jvp_call", "custom_vjp_call"})
 
 
 class Unsupported(Exception):
@@ -106,18 +98,16 @@ class ScalarInterpreter:
         return objects([x[i] for i in np.ndindex(x.shape)], x.shape)
 
     def equation(self, eqn: Any, args: list[np.ndarray]) -> list[np.ndarray]:
-        name, params = eqn.primitive.name, eqn.params
+        name = eqn.primitive.name
         sizes = [v.aval.size for v in eqn.outvars]
         if name == "dot_general":
             sizes.append(sizes[0] * int(np.prod([args[0].shape[i] for i in eqn.params["dimension_numbers"][0][0]])))
         if max(sizes, default=0) > self.limit:
             raise Unsupported("too many entries")
-        if name in CALLS:
-            inner = params[CALLS[name]]
-            if not isinstance(inner, ClosedJaxpr):
-                inner = ClosedJaxpr(inner, ())
+        inner = called(eqn, CALLS)
+        if inner is not None:
             return self.run(inner, args)
-        if name in _OPAQUE:
+        if name in WITH_DERIVATIVE:  # which their arithmetic has not
             return self.opaque(eqn, args)
         if name in ELEMENTWISE:
             return [self.elementwise(eqn, args)]

@@ -1,7 +1,7 @@
 """What is in a jaxpr."""
 
 import enum
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import jax
@@ -13,6 +13,18 @@ from jax.extend.core import ClosedJaxpr, Jaxpr
 # and 6.3 µs; of 16 links 8.8 and 8.5 µs, and 12 s to compile in place of 3.
 LARGE = 4000
 
+
+# Primitives that evaluate another jaxpr, and the parameter that holds it.
+CALLS = {
+    "checkpoint": "jaxpr",
+    "closed_call": "call_jaxpr",
+    "jit": "jaxpr",
+    "pjit": "jaxpr",
+    "remat2": "jaxpr",
+}
+# They have a derivative of their own, and the last one a batch.
+WITH_DERIVATIVE = {"custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr"}
+ALL_CALLS = {**CALLS, **WITH_DERIVATIVE, "custom_vmap_call": "call"}
 
 # Parameters that hold no jaxpr.
 _PLAIN = int | float | str | np.dtype | np.generic | enum.Enum | None
@@ -41,6 +53,20 @@ def jaxprs_in(param: Any) -> Iterator[ClosedJaxpr | Jaxpr]:
     elif not isinstance(param, _PLAIN):
         is_jaxpr = lambda x: isinstance(x, ClosedJaxpr | Jaxpr)
         yield from filter(is_jaxpr, jax.tree.leaves(param, is_leaf=is_jaxpr))
+
+
+def called(eqn: Any, calls: Mapping[str, str] = ALL_CALLS) -> ClosedJaxpr | None:
+    """The jaxpr that an equation evaluates, if it is one of these calls."""
+    if eqn.primitive.name not in calls:
+        return None
+    inner = eqn.params[calls[eqn.primitive.name]]
+    return inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
+
+
+def of_solve(p: Any, args: list[Any]) -> list[Any]:
+    """The operands of a `custom_linear_solve` that the function which finds the solution takes."""
+    start, count = sum(p["const_lengths"][:2]), p["const_lengths"].solve
+    return args[start : start + count] + args[sum(p["const_lengths"]) :]
 
 
 def is_large(fn: Callable[..., Any], *args: Any) -> bool:

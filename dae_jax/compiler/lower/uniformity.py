@@ -8,7 +8,7 @@ from typing import Any
 
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from ..jaxprs.inline import CALLS
+from ..jaxprs.walk import called
 from ..thresholds import THRESHOLDS
 from .registry import RULES
 
@@ -30,8 +30,9 @@ def varying(jaxpr: ClosedJaxpr | Jaxpr, inputs: Sequence[bool], in_memory: bool 
 def results(eqn: Any, args: list[bool], in_memory: bool = True) -> list[bool]:
     """For each result of an equation whether it may."""
     name, p, n = eqn.primitive.name, eqn.params, len(eqn.outvars)
-    if name in CALLS:
-        return varying(p[CALLS[name]], args, in_memory)
+    inner = called(eqn)
+    if inner is not None:
+        return varying(inner, args, in_memory)
     if name == "while":
         c, b = p["cond_nconsts"], p["body_nconsts"]
         return varying_in_loop(p, [args[:c], args[c : c + b], args[c + b :]], in_memory)

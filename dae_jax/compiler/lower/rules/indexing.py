@@ -72,14 +72,9 @@ def scatter_add(context: Context, x: Any, indices: Any, update: Any, **_: Any) -
 
 
 @rule("scatter-sub scatter-mul", (NUMBERS, INTEGERS, NUMBERS), by_memory=True)
-def scatter_arithmetic(context: Context, x: Any, indices: Any, update: Any, **_: Any) -> Any:
-    """An array with entries less something, or times something."""
-    return _scattered(context, x, indices, update, _combined)
-
-
 @rule("scatter-min scatter-max", (REALS | BOOL, INTEGERS, REALS | BOOL), by_memory=True)
-def scatter_extremum(context: Context, x: Any, indices: Any, update: Any, **_: Any) -> Any:
-    """An array with entries replaced by what is smaller, or larger."""
+def scatter_combined(context: Context, x: Any, indices: Any, update: Any, **_: Any) -> Any:
+    """An array with entries less something, times something, or replaced by what is smaller or larger."""
     return _scattered(context, x, indices, update, _combined)
 
 

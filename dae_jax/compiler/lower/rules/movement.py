@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,16 +15,29 @@ from ..dtypes import ALL, REALS
 from ..registry import free, rule
 
 
-def in_registers(context: Context, *args: np.ndarray) -> Any:
-    """The same entries, at other indices."""
+def movement(
+    names: str, dtypes: frozenset[str] = ALL, fuses: bool = False
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Enters a function as the rule of what moves entries in memory; in registers the same entries are at other indices."""
+
+    def enter(in_memory: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(in_memory)
+        def lower(context: Context, *args: Any, **params: Any) -> Any:
+            move = functools.partial(in_memory, **params) if context.large else _in_registers
+            return move(context, *args)
+
+        return rule(names, dtypes, cost=free, moves=True, fuses=fuses)(lower)
+
+    return enter
+
+
+def _in_registers(context: Context, *args: np.ndarray) -> Any:
     return MOVEMENTS[context.name](context.eqn, *args)
 
 
-@rule("reshape squeeze expand_dims", ALL, cost=free, moves=True)
+@movement("reshape squeeze expand_dims")
 def reshape(context: Context, x: Any, **_: Any) -> Any:
     """The same entries in order, with other indices."""
-    if not context.large:
-        return in_registers(context, x)
     x, shape = context.array(x), tuple(context.out.shape)
     found = _in_order(context, x, shape)
     if found is not None:
@@ -34,11 +47,9 @@ def reshape(context: Context, x: Any, **_: Any) -> Any:
     return View(x.dtype, shape, x.buffer, row_major(shape), x.offset)
 
 
-@rule("broadcast_in_dim", ALL, cost=free, moves=True)
+@movement("broadcast_in_dim")
 def broadcast_in_dim(context: Context, x: Any, *, shape: Any, broadcast_dimensions: Sequence[int], **_: Any) -> Any:
     """Entries at several indices."""
-    if not context.large:
-        return in_registers(context, x)
     x, shape = context.array(x), tuple(shape)
     if list(broadcast_dimensions) == sorted(broadcast_dimensions) and x.size == math.prod(shape):
         found = _in_order(context, x, shape)
@@ -49,11 +60,9 @@ def broadcast_in_dim(context: Context, x: Any, *, shape: Any, broadcast_dimensio
     return View(x.dtype, shape, x.buffer, tuple(of.get(d, 0) for d in range(len(shape))), x.offset)
 
 
-@rule("transpose", ALL, cost=free, moves=True)
+@movement("transpose")
 def transpose(context: Context, x: Any, *, permutation: Sequence[int]) -> Any:
     """Axes in another order."""
-    if not context.large:
-        return in_registers(context, x)
     x, shape = context.array(x), tuple(context.out.shape)
     if isinstance(x, Fused):
         order = np.argsort(permutation)
@@ -61,11 +70,9 @@ def transpose(context: Context, x: Any, *, permutation: Sequence[int]) -> Any:
     return View(x.dtype, shape, x.buffer, tuple(x.strides[d] for d in permutation), x.offset)
 
 
-@rule("rev", ALL, cost=free, moves=True)
+@movement("rev")
 def rev(context: Context, x: Any, *, dimensions: Sequence[int]) -> Any:
     """Axes from their end."""
-    if not context.large:
-        return in_registers(context, x)
     x = _viewed(context, context.array(x))
     offset = x.offset
     for d in dimensions:
@@ -74,11 +81,9 @@ def rev(context: Context, x: Any, *, dimensions: Sequence[int]) -> Any:
     return View(x.dtype, x.shape, x.buffer, strides, offset)
 
 
-@rule("slice", ALL, cost=free, moves=True)
+@movement("slice")
 def slice_(context: Context, x: Any, *, start_indices: Sequence[int], strides: Any, **_: Any) -> Any:
     """A part of the array."""
-    if not context.large:
-        return in_registers(context, x)
     code, x, shape = context.code, context.array(x), tuple(context.out.shape)
     starts, steps = list(map(int, start_indices)), list(map(int, strides or (1,) * x.ndim))
     if isinstance(x, Fused):
@@ -90,11 +95,9 @@ def slice_(context: Context, x: Any, *, start_indices: Sequence[int], strides: A
     return View(x.dtype, shape, x.buffer, tuple(map(int.__mul__, steps, x.strides)), offset)
 
 
-@rule("tile", ALL, cost=free, moves=True)
+@movement("tile")
 def tile(context: Context, x: Any, **_: Any) -> Any:
     """The array repeated along its axes."""
-    if not context.large:
-        return in_registers(context, x)
     x = _viewed(context, context.array(x))
     read = lambda index: context.memory.entry(x, [_modulo(context, i, n) for i, n in zip(index, x.shape, strict=True)])
     return Fused(x.dtype, tuple(context.out.shape), read, x.buffers)
@@ -104,11 +107,9 @@ def _modulo(context: Context, i: Any, n: int) -> Any:
     return i % n if isinstance(i, int) else context.code.op("urem", "i64", i, n)
 
 
-@rule("split unstack", ALL, cost=free, moves=True)
+@movement("split unstack")
 def split(context: Context, x: Any, *, axis: int, **_: Any) -> Any:
     """Pieces of an array along an axis, or its entries there."""
-    if not context.large:
-        return in_registers(context, x)
     x, start, out = context.array(x), 0, []
     entries = context.name == "unstack"
     for aval in context.outs:
@@ -124,16 +125,16 @@ def split(context: Context, x: Any, *, axis: int, **_: Any) -> Any:
     return out
 
 
-@rule("concatenate", ALL, cost=free, moves=True)
+@movement("concatenate")
 def concatenate(context: Context, *args: Any, dimension: int) -> Any:
     """Arrays one after another along an axis."""
-    return _joined(context, args, dimension, False) if context.large else in_registers(context, *args)
+    return _joined(context, args, dimension, False)
 
 
-@rule("stack", ALL, cost=free, moves=True)
+@movement("stack")
 def stack(context: Context, *args: Any, axis: int, **_: Any) -> Any:
     """Arrays one after another along a new axis."""
-    return _joined(context, args, axis, True) if context.large else in_registers(context, *args)
+    return _joined(context, args, axis, True)
 
 
 def _joined(context: Context, args: Sequence[Any], axis: int, along_new: bool) -> View:
@@ -148,11 +149,9 @@ def _joined(context: Context, args: Sequence[Any], axis: int, along_new: bool) -
     return result
 
 
-@rule("pad", ALL, cost=free, moves=True)
+@movement("pad")
 def pad(context: Context, x: Any, fill: Any, *, padding_config: Any) -> Any:
     """Something else around the entries and between them; of a negative width that many entries are left out."""
-    if not context.large:
-        return in_registers(context, x, fill)
     memory, x = context.memory, context.array(x) if x.ndim else x
     config = [tuple(map(int, c)) for c in padding_config]
     value = memory.entry(fill, [])
@@ -169,11 +168,9 @@ def pad(context: Context, x: Any, fill: Any, *, padding_config: Any) -> Any:
     return View(result.dtype, tuple(context.out.shape), result.buffer, result.strides, left_out)
 
 
-@rule("iota", REALS, cost=free, moves=True, fuses=True)
+@movement("iota", REALS, fuses=True)
 def iota(context: Context, *, dimension: int, **_: Any) -> Any:
     """Indices along an axis."""
-    if not context.large:
-        return in_registers(context)
     code, to, of = context.code, context.to, np.dtype("int64")
     number = lambda i: convert(code, np.int64(i) if isinstance(i, int) else i, of, to)
     return Fused(to, tuple(context.out.shape), lambda index: number(index[dimension]), ())
