@@ -215,7 +215,9 @@ def test_modules_and_version_are_there_when_they_are_used():
 
 def test_multipliers_at_a_point_of_redundant_constraints_need_the_rank():
     doubled = lambda rank: dae_jax.ConstrainedSystem(
-        lambda t, q, v, args: jnp.array([0.0, 9.81]), lambda t, q, args: jnp.stack([(q @ q - 1) / 2, q @ q - 1]), rank=rank
+        lambda t, q, v, args: jnp.array([0.0, 9.81]),
+        lambda t, q, args: jnp.stack([(q @ q - 1) / 2, q @ q - 1]),
+        rank=rank,
     )
     at = 0.0, jnp.array([1.0, 0.0]), jnp.array([0.0, 2.0])
     with pytest.raises(ValueError, match="say how many are independent"):

@@ -43,9 +43,7 @@ def test_order_five():
 def test_index_five_which_is_beyond_methods_for_the_equations_as_written():
     scene = SCENES["integrators-5"]()
     with pytest.raises(ValueError, match="index up to 2"):
-        dae_jax.daesolve(
-            scene.system, dae_jax.BDF(), 0.0, scene.t1, None, scene.y0, formulation=dae_jax.Residual()
-        )
+        dae_jax.daesolve(scene.system, dae_jax.BDF(), 0.0, scene.t1, None, scene.y0, formulation=dae_jax.Residual())
     sol = solved(scene.system, dae_jax.BDF(), scene.t1, scene.y0, 1e-9)
     assert scene.error(np.array([scene.t1]), sol.ys) < 1e-8
 

@@ -121,8 +121,11 @@ def chain(n):
 )
 def test_a_chain_of_one_link(solver, formulation):
     y0 = (jnp.array([1.0, 0.0]), jnp.zeros(2))
-    plain = dae_jax.ConstrainedSystem(lambda t, q, v, args: jnp.array([0.0, -9.81]), lambda t, q, args: (q @ q - 1)[None])
+    plain = dae_jax.ConstrainedSystem(
+        lambda t, q, v, args: jnp.array([0.0, -9.81]), lambda t, q, args: (q @ q - 1)[None]
+    )
     found, expected = (
-        dae_jax.daesolve(system, solver, 0.0, 0.5, None, y0, formulation=formulation).ys[0] for system in (chain(1), plain)
+        dae_jax.daesolve(system, solver, 0.0, 0.5, None, y0, formulation=formulation).ys[0]
+        for system in (chain(1), plain)
     )
     np.testing.assert_allclose(found, expected, rtol=1e-9)

@@ -194,7 +194,9 @@ def test_a_condition_that_is_no_number_is_an_error(direction):
 def test_a_condition_that_is_no_number_within_a_step_is_said_to_be_so():
     """Where a root finder looks, not only where the solve ends."""
     system = dae_jax.ImplicitDAE(lambda t, y, yd, args: yd + y)
-    event = diffrax.Event(lambda t, y, args, **kwargs: jnp.where(abs(t - 0.5) < 0.05, jnp.nan, t - 0.5), optimistix.Newton(1e-8, 1e-8))
+    event = diffrax.Event(
+        lambda t, y, args, **kwargs: jnp.where(abs(t - 0.5) < 0.05, jnp.nan, t - 0.5), optimistix.Newton(1e-8, 1e-8)
+    )
     ended = dae_jax.daesolve(system, diffrax.Tsit5(), 0.0, 1.0, 0.2, np.ones(1), event=event, throw=False)
     assert ended.result == dae_jax.RESULTS.undefined_condition
 

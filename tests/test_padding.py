@@ -128,7 +128,14 @@ def test_a_time_beyond_the_ends_is_no_padding(beyond):
 
     def solve(ts):
         sol = dae_jax.daesolve(
-            system, diffrax.Tsit5(), 0.0, t1, None, (jnp.ones(1), jnp.ones(1)), saveat=diffrax.SaveAt(ts=ts), throw=False
+            system,
+            diffrax.Tsit5(),
+            0.0,
+            t1,
+            None,
+            (jnp.ones(1), jnp.ones(1)),
+            saveat=diffrax.SaveAt(ts=ts),
+            throw=False,
         )
         return sol.result == dae_jax.RESULTS.times_outside, sol.result == dae_jax.RESULTS.successful
 

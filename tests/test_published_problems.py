@@ -15,7 +15,9 @@ PUMP = charge_pump()
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("solver", "factor"), [(dae_jax.RadauIIA5(), 100), (dae_jax.BDF(), 20_000)], ids=["radau", "bdf-of-dummy-derivatives"]
+    ("solver", "factor"),
+    [(dae_jax.RadauIIA5(), 100), (dae_jax.BDF(), 20_000)],
+    ids=["radau", "bdf-of-dummy-derivatives"],
 )
 def test_a_charge_pump_passes_its_kinks(solver, factor):
     """Those in the charges, where a capacitance and with it the current jumps, are not announced; also where `atol` is far

@@ -81,7 +81,8 @@ def cubic(x, n):
 
 
 @pytest.mark.parametrize(
-    ("order", "pull_back"), [*((order, "own") for order in ORDERS), ("hessian", "of JAX"), ("gradient of gradient", "of JAX")]
+    ("order", "pull_back"),
+    [*((order, "own") for order in ORDERS), ("hessian", "of JAX"), ("gradient of gradient", "of JAX")],
 )
 def test_of_a_kernel(order, pull_back):
     order = ORDERS[order]

@@ -72,7 +72,15 @@ def angle_map(
         q0 = chart(jnp.stack([p["first"], p["second"]]))
         y0 = (q0, jnp.zeros_like(q0))
         sol = daesolve(
-            system, solver, 0.0, t1, None, y0, saveat=diffrax.SaveAt(ts=times), stepsize_controller=controller, throw=False
+            system,
+            solver,
+            0.0,
+            t1,
+            None,
+            y0,
+            saveat=diffrax.SaveAt(ts=times),
+            stepsize_controller=controller,
+            throw=False,
         )
         shown = jax.vmap(drawing.points)(sol.ts, sol.ys[0])
         flips = [first_flip(sol.ts, shown[:, end] - shown[:, start]) for start, end in drawing.links]

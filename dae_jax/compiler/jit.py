@@ -100,7 +100,9 @@ def _of_arrays(fn: Callable[..., Any], args: Any, kwargs: Any) -> tuple[Callable
 
     def flat(*arrays: Any) -> Arrays:
         given = iter(arrays)
-        args, kwargs = jax.tree.unflatten(treedef, [next(given) if t else x for x, t in zip(leaves, traced, strict=True)])
+        args, kwargs = jax.tree.unflatten(
+            treedef, [next(given) if t else x for x, t in zip(leaves, traced, strict=True)]
+        )
         out, tree[:] = _flattened(fn(*args, **kwargs))
         return out
 

@@ -54,7 +54,9 @@ def _reverse(fn: Callable[..., Any], pull_back: PullBack | None, forward: Callab
         def _(xs: Any, dxs: Any) -> Any:
             out = solve(*xs)
             ys, of_ys = jax.tree.flatten(out)
-            push = _derivative(fn, pull_back, forward, treedef, list(map(is_inexact, xs)), of_ys, list(map(is_inexact, ys)))
+            push = _derivative(
+                fn, pull_back, forward, treedef, list(map(is_inexact, xs)), of_ys, list(map(is_inexact, ys))
+            )
             found = iter(push(xs, [dx for x, dx in zip(xs, dxs, strict=True) if is_inexact(x)], inexact(ys)))
             dys = [next(found) if is_inexact(y) else np.zeros(jnp.shape(y), jax.dtypes.float0) for y in ys]
             return out, jax.tree.unflatten(of_ys, dys)

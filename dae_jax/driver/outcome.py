@@ -39,7 +39,9 @@ def judged(solve: Any, out: Any, problem: Problem, found: Any) -> DAESolution:
     code = RESULTS.where(went_well & ~end.near, RESULTS.off_constraints, code)
     code = RESULTS.where(went_well & _outside(solve.saveat, problem), RESULTS.times_outside, code)
     code = RESULTS.where(end.masses & (end.masses_ahead | went_well), code, RESULTS.irregular_mass)
-    for wrong, name in enumerate(("inconsistent_start", "dependent_constraints", "irregular_mass", "ambiguous_start"), 1):
+    for wrong, name in enumerate(
+        ("inconsistent_start", "dependent_constraints", "irregular_mass", "ambiguous_start"), 1
+    ):
         code = RESULTS.where(start == wrong, getattr(RESULTS, name), code)
     rank = problem.rank[1] if isinstance(problem.rank, tuple) else problem.rank
     return DAESolution(*fields, code, event_mask, problem.args, rank, precision)

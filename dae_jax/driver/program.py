@@ -149,7 +149,9 @@ class Solve(eqx.Module):
         def pull_back(inputs: Any, cotangent: Any) -> list[Any]:
             (arrays,) = inputs
             solve, problem = program.whole(arrays)
-            recording, also_arrays = dataclasses.replace(solve._forwards(), saveat=recorded(solve.saveat)).kernel(problem)
+            recording, also_arrays = dataclasses.replace(solve._forwards(), saveat=recorded(solve.saveat)).kernel(
+                problem
+            )
             _, _, ts, ys, *_ = recording(also_arrays).numbers
             numbers, others = eqx.partition(arrays, eqx.is_inexact_array)
             fixed: list[Any] = []

@@ -57,7 +57,9 @@ class ReducedResidual(AbstractResidualFormulation):
     def keeps(self) -> tuple[bool, bool]:
         return True, True
 
-    def encode(self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None) -> tuple[Any, LinearisedResidual]:
+    def encode(
+        self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None
+    ) -> tuple[Any, LinearisedResidual]:
         y, ode = DummyDerivatives().encode(system, t, state, args, rank)
         form = Index1Form(ode, ode.selection(t, y, None)[0])
         z = form.encode(t, y)

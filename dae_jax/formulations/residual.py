@@ -34,7 +34,9 @@ class Residual(AbstractResidualFormulation):
     def keeps(self) -> tuple[bool, bool]:
         return self.form != "index-2", self.form != "index-3"
 
-    def encode(self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None) -> tuple[Any, LinearisedResidual]:
+    def encode(
+        self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None
+    ) -> tuple[Any, LinearisedResidual]:
         form = ResidualForm.of(system, t, state, args, self.form)
         if self.variable_index is not None and len(self.variable_index) != form.size:
             raise ValueError(

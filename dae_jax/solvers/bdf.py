@@ -215,7 +215,17 @@ def _start(rates: Float[Array, " n"], factors: Any) -> _State:
     zero, count = jnp.zeros((), rates.dtype), jnp.zeros((), int)
     phi = jnp.stack([rates] + [jnp.zeros_like(rates)] * (MAX_ORDER - 1))
     return _State(
-        phi, jnp.ones(len(ROWS), rates.dtype), count, count + 1, count, count, count == 0, zero, count > 0, factors, zero,
+        phi,
+        jnp.ones(len(ROWS), rates.dtype),
+        count,
+        count + 1,
+        count,
+        count,
+        count == 0,
+        zero,
+        count > 0,
+        factors,
+        zero,
         zero + 1,
     )
 

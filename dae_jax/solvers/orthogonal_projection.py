@@ -87,7 +87,9 @@ class OrthogonalProjection(diffrax.AbstractWrappedSolver, AbstractManifoldSolver
             return args.project(sign * t, y)
 
         if hasattr(solver, "step_and_retract"):
-            y1, error, dense, state, found = solver.step_and_retract(terms, t0, t1, y0, args, solver_state, made_jump, retract)
+            y1, error, dense, state, found = solver.step_and_retract(
+                terms, t0, t1, y0, args, solver_state, made_jump, retract
+            )
             result = diffrax.RESULTS.successful
         else:
             ahead, error, dense, state, result = solver.step(terms, t0, t1, y0, args, solver_state, made_jump)

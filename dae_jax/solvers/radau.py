@@ -331,9 +331,7 @@ def _between(state: _State, h: Any, z: Any) -> Float[Array, " n"]:
 def _coupled(step: _Step, z: Float[Array, "3 n"]) -> Any:
     """The Jacobian of all stages at the solution, in the storage of their unknowns interleaved."""
     found = step.at_stages(step.jacobians, z)
-    storage, matrix = step.linearised.storage.coupled(
-        [j for j, _ in found], [m for _, m in found], step.rates / step.h
-    )
+    storage, matrix = step.linearised.storage.coupled([j for j, _ in found], [m for _, m in found], step.rates / step.h)
     return storage, matrix, jnp.repeat(step.linearised.column_scale(step.h), 3)
 
 

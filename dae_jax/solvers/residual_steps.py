@@ -123,9 +123,7 @@ def not_begun(start: Any, eta: Any) -> Newton:
     return Newton(start, 0, zero, eta, zero, no, no, no)
 
 
-def simplified_newton(
-    correction: Callable[[Any], Any], start: Any, scale: Any, eta: Any, tol: Tolerances
-) -> Newton:
+def simplified_newton(correction: Callable[[Any], Any], start: Any, scale: Any, eta: Any, tol: Tolerances) -> Newton:
     """Corrects `start` until what remains, η ‖Δx‖, is small beside the tolerance; ‖Δx‖ is that of Δx · `scale`.
 
     Source: E. Hairer, G. Wanner, *Solving Ordinary Differential Equations II*, section IV.8.

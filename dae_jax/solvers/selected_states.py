@@ -72,9 +72,13 @@ class SelectedResiduals(AbstractResidualSolver):
 
     def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Selection, made_jump: Any) -> Any:
         ode = args.form.ode
-        directions, switched = ode.selection(time_sign(terms, t0, t1) * t0, y0[: ode.orders.size], solver_state.directions)
+        directions, switched = ode.selection(
+            time_sign(terms, t0, t1) * t0, y0[: ode.orders.size], solver_state.directions
+        )
         solver = dataclasses.replace(self.solver, rtol=self.rtol, atol=self.atol)
         linearised = eqx.tree_at(lambda p: p.form.directions, args, directions)
-        state = jax.tree.map(lambda a, b: jnp.where(switched, a, b), self.invalidate_jacobian(solver_state), solver_state)
+        state = jax.tree.map(
+            lambda a, b: jnp.where(switched, a, b), self.invalidate_jacobian(solver_state), solver_state
+        )
         *step, inner, result = solver.step(terms, t0, t1, y0, linearised, state.inner, made_jump)
         return *step, Selection(inner, directions, solver_state.switches + switched), result

@@ -37,7 +37,9 @@ def assert_expanded(fn, *args):
 @pytest.mark.parametrize("n", SIZES)
 def test_lu_and_what_is_made_of_it(n):
     a, b = matrix(n, n), matrix(n)
-    assert_expanded(lambda a, b: (*jax.lax.linalg.lu(a), jnp.linalg.solve(a, b), jnp.linalg.inv(a), jnp.linalg.det(a)), a, b)
+    assert_expanded(
+        lambda a, b: (*jax.lax.linalg.lu(a), jnp.linalg.solve(a, b), jnp.linalg.inv(a), jnp.linalg.det(a)), a, b
+    )
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -72,7 +74,9 @@ def test_qr_where_squares_overflow_or_are_zero(dtype, mode):
         np.testing.assert_allclose(q.conj().T @ q, np.eye(q.shape[1]), atol=100 * limits.eps)
 
 
-@pytest.mark.parametrize("fn", [jnp.linalg.cholesky, jnp.linalg.qr, jnp.linalg.inv, jax.lax.linalg.lu, jnp.sort, jnp.argsort])
+@pytest.mark.parametrize(
+    "fn", [jnp.linalg.cholesky, jnp.linalg.qr, jnp.linalg.inv, jax.lax.linalg.lu, jnp.sort, jnp.argsort]
+)
 @pytest.mark.parametrize("transform", [lambda fn: fn, jax.vmap])
 def test_no_entries(fn, transform):
     a = np.zeros((2, 0, 0))
@@ -114,7 +118,13 @@ NUMBERS = np.array([3.0, np.nan, -0.0, 0.0, np.inf, -np.inf, 1.0, 1.0, -2.5])
 
 @pytest.mark.parametrize(
     "x",
-    [NUMBERS, NUMBERS.astype(np.float32), np.array([1, 2**31 + 5, 7], np.uint32), np.array([3, -1, 2]), np.array([True, False])],
+    [
+        NUMBERS,
+        NUMBERS.astype(np.float32),
+        np.array([1, 2**31 + 5, 7], np.uint32),
+        np.array([3, -1, 2]),
+        np.array([True, False]),
+    ],
 )
 def test_sorting_in_every_order(x):
     for fn in (jnp.sort, jnp.argsort, lambda x: jnp.sort(x, descending=True)):

@@ -66,13 +66,15 @@ REVERSE = {
     "hessian": lambda f: jax.hessian(total(f)),
     "jacrev of jacfwd": lambda f: jax.jacrev(jax.jacfwd(f)),
     "jacrev of jacrev": lambda f: jax.jacrev(jax.jacrev(f)),
-    "grad of grad of grad": lambda f: (
-        jax.grad(lambda x: jnp.sum(jax.grad(lambda x: jnp.sum(jax.grad(total(f))(x) ** 2))(x) ** 2))
+    "grad of grad of grad": lambda f: jax.grad(
+        lambda x: jnp.sum(jax.grad(lambda x: jnp.sum(jax.grad(total(f))(x) ** 2))(x) ** 2)
     ),
     "vmap of grad": lambda f: lambda x: jax.vmap(jax.grad(total(f)))(BATCH(x)),
     "grad of vmap": lambda f: jax.grad(lambda x: jnp.sum(jax.vmap(f)(BATCH(x)) ** 2)),
     "grad of a checkpoint": lambda f: jax.grad(jax.checkpoint(total(f))),
-    "jit of vmap of vmap": lambda f: jax.jit(lambda x: jax.vmap(jax.vmap(jax.grad(total(f))))(jnp.stack([BATCH(x)] * 2))),
+    "jit of vmap of vmap": lambda f: jax.jit(
+        lambda x: jax.vmap(jax.vmap(jax.grad(total(f))))(jnp.stack([BATCH(x)] * 2))
+    ),
 }
 
 
@@ -301,7 +303,9 @@ class TestErrors:
 
 
 class TestWhatJaxIsToldForDebugging:
-    @pytest.mark.parametrize("fn", [jnp.log, jax.grad(jnp.sqrt), lambda x: jax.lax.fori_loop(0, 3, lambda i, x: jnp.log(x), x)])
+    @pytest.mark.parametrize(
+        "fn", [jnp.log, jax.grad(jnp.sqrt), lambda x: jax.lax.fori_loop(0, 3, lambda i, x: jnp.log(x), x)]
+    )
     def test_what_is_not_a_number_raises(self, fn):
         with jax.debug_nans(True), pytest.raises(FloatingPointError, match="nan"):
             jit(fn)(-1.0)

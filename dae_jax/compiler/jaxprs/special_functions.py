@@ -117,4 +117,6 @@ def by_simpler_ones(eqn: Any) -> ClosedJaxpr:
 
 @functools.lru_cache(maxsize=64)
 def _traced(name: str, structs: tuple[Any, ...], params: tuple[Any, ...]) -> ClosedJaxpr:
-    return jax.make_jaxpr(functools.partial(SPECIAL[name], **dict(params)))(*(jax.ShapeDtypeStruct(*s) for s in structs))
+    return jax.make_jaxpr(functools.partial(SPECIAL[name], **dict(params)))(
+        *(jax.ShapeDtypeStruct(*s) for s in structs)
+    )

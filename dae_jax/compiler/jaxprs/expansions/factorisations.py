@@ -59,7 +59,11 @@ def _lu_written_out(a: Any) -> tuple[Any, Any, Any]:
         by = jnp.where(_size(rows[k][k]) == 0, 1, rows[k][k])
         for i in range(k + 1, m):
             factor = rows[i][k] / by
-            rows[i] = [*rows[i][:k], factor, *(x - factor * y for x, y in zip(rows[i][k + 1 :], rows[k][k + 1 :], strict=True))]
+            rows[i] = [
+                *rows[i][:k],
+                factor,
+                *(x - factor * y for x, y in zip(rows[i][k + 1 :], rows[k][k + 1 :], strict=True)),
+            ]
     return jnp.stack([jnp.stack(row) for row in rows]), jnp.stack(pivots), jnp.stack(order)
 
 
