@@ -20,7 +20,10 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "The initial state `y0` violates the equations or the hidden constraints (of a mechanism: at position or velocity level). "
         "`dae_jax.consistent_state(system, t0, y0, args)` gives the nearest state that does not."
     )
-    ambiguous_start = "The equations are nonlinear in ẏ, and several ẏ satisfy them at the start: say which by `yd0`, ẏ at the start or near it."
+    ambiguous_start = (
+        "The equations are nonlinear in ẏ, and several ẏ satisfy them at the start: say which by `yd0`, ẏ at the start or "
+        "near it."
+    )
     dependent_constraints = (
         "The constraints depend on each other at the start, or not as many are independent as `rank` says: a gradient "
         "vanishes (write the constraint itself, not its square), the start is a singular configuration, or constraints are "

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 
-PACKAGE = Path(__file__).parent.parent / "dae_jax"
+PACKAGE = Path(__file__).parents[2] / "dae_jax"
 # Rooms: the folders and files directly below the package. Those on one floor do not know each other.
 FLOORS = (
     {"_compat", "compiler", "systems"},

@@ -3,10 +3,10 @@
 import re
 from pathlib import Path
 
-from tests.test_layers import FLOORS
+from tests.house.test_layers import FLOORS
 
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "CONTRIBUTING.md").read_text()
 
 

@@ -205,7 +205,7 @@ def test_modules_and_version_are_there_when_they_are_used():
         "assert {'scenes', '__version__'} <= set(dir(dae_jax))"
     )
     done = subprocess.run(
-        [sys.executable, "-c", program], cwd=Path(__file__).parent.parent, capture_output=True, text=True, check=False
+        [sys.executable, "-c", program], cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout[0].isdigit()
