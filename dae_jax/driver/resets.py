@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -11,17 +11,23 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from .._compat import while_loop
 from ..consistent import consistent_state
+from ..equations.constraint_jacobian import Rank
 from ..equations.structural_ode import underlying_ode
 from ..solution import RESULTS, DAESolution, precision_of
 from ..systems import System
+from ..types import Args, BoolLike, Scalar, State, Time, Y
 from ..validate.states import NUMBERS, brief, broadcast_to_state, describe
 from ..validate.user_functions import refuse_other_arguments, returned
-from .problem import Problem
+from .problem import Problem, count_of
 from .start import saved_parts
+
+
+if TYPE_CHECKING:
+    from .program import Solve
 
 
 # Entries of `stats` that do not add up over the parts of a solve.
@@ -67,7 +73,7 @@ class Jump(eqx.Module):
             raise ValueError(f"`most` of Jump must be an integer of at least 1, but is {brief(self.most)}.")
 
 
-def refuse_wrong_event(event: Any, t: Any, y: Any, args: Any) -> None:
+def refuse_wrong_event(event: diffrax.Event | Jump | None, t: Time, y: State, args: Args) -> None:
     """Refuses functions of an event that cannot be called with (t, y, args), or do not return what they must."""
     if event is None:
         return
@@ -79,7 +85,9 @@ def refuse_wrong_event(event: Any, t: Any, y: Any, args: Any) -> None:
         _refuse_wrong_jump(event, t, y, args)
 
 
-def _refuse_wrong_condition(condition: Any, t: Any, y: Any, args: Any, kinds: str) -> None:
+def _refuse_wrong_condition(
+    condition: Callable[..., Time | BoolLike], t: Time, y: State, args: Args, kinds: str
+) -> None:
     refuse_other_arguments("condition(t, y, args, **kwargs)", condition, 3, terms=None, solver=None, t0=None, t1=None)
     found = returned("condition(t, y, args, **kwargs)", condition, t, y, args)
     fits = isinstance(found, NUMBERS) and jnp.shape(found) == ()
@@ -90,7 +98,7 @@ def _refuse_wrong_condition(condition: Any, t: Any, y: Any, args: Any, kinds: st
         )
 
 
-def _refuse_wrong_jump(event: Jump, t: Any, y: Any, args: Any) -> None:
+def _refuse_wrong_jump(event: Jump, t: Time, y: State, args: Args) -> None:
     found = returned("jump(t, y, args)", event.jump, t, y, args)
     shapes = lambda tree: (jax.tree.structure(tree), [jnp.shape(x) for x in jax.tree.leaves(tree)])
     if not isinstance(found, tuple | list) or len(found) != 2 or shapes(tuple(found)) != shapes((y, args)):
@@ -119,7 +127,7 @@ class _FromStart(eqx.Module):
     t0: Any
     level: Any
 
-    def __call__(self, t: Any, y: Any, args: Any, **kwargs: Any) -> Any:
+    def __call__(self, t: Time, y: Y, args: PyTree, **kwargs: object) -> Any:
         return self.sign * jnp.where(t == self.t0, self.level, self.condition(t, y, args, **kwargs))
 
 
@@ -140,11 +148,12 @@ class _Progress(NamedTuple):
     level: Float[Array, ""]
 
 
-def solve_with_jumps(solve: Any, problem: Problem) -> tuple[DAESolution, Any]:
+def solve_with_jumps(solve: "Solve", problem: Problem) -> tuple[DAESolution, Any]:
     """What `solve` gives, part by part; `solve.event` is a `Jump`."""
     system, t0, y0, args = problem.start
     t1, rank = problem.t1, problem.rank
     jump, (output,) = solve.event, saved_parts(solve.saveat)
+    assert isinstance(jump, Jump)
     empty = jnp.zeros(0, t0.dtype)
     wanted = jnp.concatenate(
         [t0[None] if output.t0 else empty, empty if output.ts is None else output.ts, t1[None] if output.t1 else empty]
@@ -188,7 +197,8 @@ def solve_with_jumps(solve: Any, problem: Problem) -> tuple[DAESolution, Any]:
         return _Progress(end, y, args, p.count + (jumps & ~exhausted), times, ts, ys, stats, code, level)
 
     unknown = jnp.zeros_like(t0)
-    shape = jax.eval_shape(part, _Progress(t0, y0, args, *[None] * 6, unknown))[0]
+    none: Any = None
+    shape = jax.eval_shape(part, _Progress(t0, y0, args, none, none, none, none, none, none, unknown))[0]
     unsaved = jax.tree.map(lambda x: jnp.full(x.shape, jnp.inf, x.dtype), shape.ys["wanted"])
     stats = {k: jnp.zeros((), int) for k in shape.stats if k not in NO_COUNTS}
     start = _Progress(
@@ -196,12 +206,12 @@ def solve_with_jumps(solve: Any, problem: Problem) -> tuple[DAESolution, Any]:
         jnp.full_like(wanted, jnp.inf), unsaved, stats, jnp.asarray(going, RESULTS.successful._value.dtype), unknown,
     )  # fmt: skip
     kind: Any = "checkpointed" if solve.derivative() == "reverse" else "lax"
-    most = {"max_steps": jump.most + 1} if kind == "checkpointed" else {}
-    p = while_loop(lambda p: p.code == going, advance, start, kind=kind, **most)
+    most = jump.most + 1 if kind == "checkpointed" else None
+    p = while_loop(lambda p: p.code == going, advance, start, kind=kind, max_steps=most)
     stats = {"max_steps": solve.max_steps, **p.stats, "end_time": p.t, "jumps": p.count, "jump_times": p.times}
     result = eqx.tree_at(lambda r: r._value, RESULTS.successful, p.code)
     precision = precision_of(t0.dtype, solve.controller)
-    sol = DAESolution(t0, t1, p.ts, p.ys, None, stats, result, None, args, rank, precision)
+    sol = DAESolution(t0, t1, p.ts, p.ys, None, stats, result, None, args, count_of(rank), precision)
     refused = (
         RESULTS.inconsistent_start,
         RESULTS.dependent_constraints,
@@ -211,7 +221,7 @@ def solve_with_jumps(solve: Any, problem: Problem) -> tuple[DAESolution, Any]:
     return sol, ~jnp.any(jnp.stack([p.code == code._value for code in refused]))
 
 
-def _after(system: System, jump: Jump, t: Any, y: Any, args: Any) -> tuple[Any, Any]:
+def _after(system: System, jump: Jump, t: Time, y: State, args: Args) -> tuple[Any, Any]:
     """The state and the args after a jump."""
     y, new = jump.jump(t, y, args)
     y = consistent_state(system, t, y, new, fixed=jump.fixed)
@@ -219,7 +229,13 @@ def _after(system: System, jump: Jump, t: Any, y: Any, args: Any) -> tuple[Any, 
 
 
 def _level_at_start(
-    system: System, condition: Callable[..., Any], t: Any, y: Any, args: Any, before: Any, rank: int | None
+    system: System,
+    condition: Callable[..., Time],
+    t: Scalar,
+    y: State,
+    args: Args,
+    before: Scalar,
+    rank: int | Rank | None,
 ) -> Any:
     """The condition at the start of a part; where this is zero, the sign with which it leaves zero. That is the sign with
     which it came, −`before`, where its rate is not known.

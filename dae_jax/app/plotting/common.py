@@ -40,7 +40,7 @@ BLANK = "#DDDDDD"
 FILE_TYPES = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".eps", ".ps", ".tif", ".tiff", ".webp")
 
 
-def saved(times: Any, *values: Any) -> tuple[np.ndarray, ...]:
+def saved(times: np.ndarray, *values: Any) -> tuple[np.ndarray, ...]:
     """Times and what belongs to them without the padding of a solve that ended early or saved its steps."""
     kept = np.isfinite(np.asarray(times))
     return tuple(np.asarray(x)[kept] for x in (times, *values))
