@@ -27,7 +27,7 @@ from .solution import precision_of
 from .solve import prepared
 from .solvers import takes_residuals
 from .systems import ConstrainedSystem, System, is_mechanism
-from .types import Args, Flat, State, Time
+from .types import Args, Controller, Flat, ProgressMeter, Solver, State, Time
 from .validate.states import counted
 
 
@@ -171,17 +171,17 @@ class ResidualPlan(Plan):
 
 def explain(
     system: System,
-    solver: diffrax.AbstractSolver,
+    solver: Solver,
     t0: Time,
     y0: State,
     args: Args = None,
     *,
     formulation: AbstractFormulation | None = None,
     saveat: diffrax.SaveAt = diffrax.SaveAt(t1=True),  # noqa: B008
-    stepsize_controller: diffrax.AbstractStepSizeController | None = None,
+    stepsize_controller: Controller | None = None,
     adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint(),  # noqa: B008
     event: diffrax.Event | None = None,
-    progress_meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter(),  # noqa: B008
+    progress_meter: ProgressMeter = diffrax.NoProgressMeter(),  # noqa: B008
 ) -> Plan:
     """How `daesolve` would solve this, with the same arguments; nothing is solved.
 

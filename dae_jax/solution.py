@@ -85,7 +85,7 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "it), or another method."
     )
     too_many_jumps = (
-        "There were more jumps than `Jump(most=...)` allows: raise it, or look whether the jumps pile up at one time, as "
+        "There were more resets than `Reset(max_resets=...)` allows: raise it, or look whether they pile up at one time, as "
         "those of a ball that comes to rest do."
     )
 

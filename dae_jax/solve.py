@@ -14,7 +14,7 @@ from .driver.failures import OKAY, in_words, raised_in_the_program
 from .driver.options import refuse_misfits, refuse_no_event, refuse_other_steps, refuse_wrong_options
 from .driver.problem import Problem, Program, split
 from .driver.program import KEPT, Solve, run
-from .driver.resets import Jump, refuse_other_outputs
+from .driver.resets import Reset, refuse_other_outputs
 from .driver.start import as_array, checked, refuse_bad_start, refuse_bad_times
 from .equations.residual_form import Form
 from .formulations import (
@@ -28,7 +28,7 @@ from .formulations import (
 from .solution import DAESolution
 from .solvers import AbstractResidualSolver, SelectedResiduals, SelectedStates, takes_residuals
 from .systems import System, is_mechanism
-from .types import Args, DType, State, Time
+from .types import Args, Controller, DType, ProgressMeter, Solver, State, Time
 from .validate.states import with_rates
 from .validate.user_functions import not_finite, refuse_wrong_functions
 
@@ -38,7 +38,7 @@ _of_known_rank: dict[Program, Program] = {}
 
 def daesolve(
     system: System,
-    solver: diffrax.AbstractSolver,
+    solver: Solver,
     t0: Time,
     t1: Time,
     dt0: Time | None,
@@ -48,12 +48,12 @@ def daesolve(
     yd0: State = None,
     formulation: AbstractFormulation | None = None,
     saveat: diffrax.SaveAt = diffrax.SaveAt(t1=True),  # noqa: B008
-    stepsize_controller: diffrax.AbstractStepSizeController | None = None,
+    stepsize_controller: Controller | None = None,
     adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint(),  # noqa: B008
-    event: diffrax.Event | Jump | None = None,
+    event: diffrax.Event | Reset | None = None,
     max_steps: int | None = 4096,
     throw: bool = True,
-    progress_meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter(),  # noqa: B008
+    progress_meter: ProgressMeter = diffrax.NoProgressMeter(),  # noqa: B008
 ) -> DAESolution:
     """Solves a differential-algebraic equation. Mirrors `diffrax.diffeqsolve`.
 
@@ -72,8 +72,8 @@ def daesolve(
     - `stepsize_controller`: by default fixed steps if `dt0` is given, else `PIDController(rtol=1e-8, atol=1e-8)` (1e-5 in
       float32).
     - `saveat`, `adjoint`, `event`, `max_steps`, `throw`, `progress_meter`: as in diffrax. Functions in `saveat` and
-      `event` get the state in the structure of `y0`, and the user's `args`. With a `Jump` as `event` the solve goes on
-      after it. Second derivatives are there in any order of modes, third ones with `jax.jacfwd` outside; with a `Jump`,
+      `event` get the state in the structure of `y0`, and the user's `args`. With a `Reset` as `event` the solve goes on
+      after it. Second derivatives are there in any order of modes, third ones with `jax.jacfwd` outside; with a `Reset`,
       a progress meter or without one kernel forward-mode derivatives need `adjoint=diffrax.ForwardMode()`.
 
     **Returns** a `DAESolution`.
@@ -95,7 +95,7 @@ def daesolve(
 
 def prepared(
     system: System,
-    solver: diffrax.AbstractSolver,
+    solver: Solver,
     t0: Time,
     t1: Time,
     dt0: Time | None,
@@ -103,11 +103,11 @@ def prepared(
     args: Args,
     formulation: AbstractFormulation | None,
     saveat: diffrax.SaveAt,
-    stepsize_controller: diffrax.AbstractStepSizeController | None,
+    stepsize_controller: Controller | None,
     adjoint: diffrax.AbstractAdjoint,
-    event: diffrax.Event | Jump | None,
+    event: diffrax.Event | Reset | None,
     max_steps: int | None,
-    progress_meter: diffrax.AbstractProgressMeter,
+    progress_meter: ProgressMeter,
 ) -> tuple[Solve, Problem]:
     """The method and the problem of a solve, checked, with the defaults filled in."""
     y0, args = checked(system, t0, t1, dt0, y0, args)
@@ -137,7 +137,7 @@ def prepared(
     saveat = jax.tree.map(lambda x: as_array(x, dtype) if isinstance(x, np.ndarray | jax.Array) else x, saveat)
     if event is not None:
         refuse_no_event(solver)
-    if isinstance(event, Jump):
+    if isinstance(event, Reset):
         refuse_other_outputs(saveat)
     solve = Solve(formulation, solver, saveat, stepsize_controller, adjoint, event, max_steps, progress_meter)
     return solve, Problem(system, start, end, step, y0, args, getattr(system, "rank", None))

@@ -6,6 +6,7 @@ A shape in an alias is checked where it is used, like any of jaxtyping's: two `F
 from collections.abc import Hashable
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+import diffrax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree, Real
 
@@ -28,6 +29,11 @@ IntScalar: TypeAlias = Int[Array, ""]
 DType: TypeAlias = np.dtype | type
 # The structure of a pytree.
 TreeDef: TypeAlias = Hashable
+
+# Those of diffrax, whatever they keep from step to step.
+Solver: TypeAlias = diffrax.AbstractSolver[Any]
+Controller: TypeAlias = diffrax.AbstractStepSizeController[Any, Any]
+ProgressMeter: TypeAlias = diffrax.AbstractProgressMeter[Any]
 
 # Numbers that a user may write as Python's: of time, and yes or no.
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from ..formulations import AbstractFormulation, AbstractResidualFormulation
 from ..solvers import AbstractManifoldSolver, is_explicit, takes_residuals
 from ..types import Time
 from ..validate.states import NUMBERS, brief
-from .resets import Jump
+from .resets import Reset
 
 
 EXPECTED = {
@@ -25,8 +25,8 @@ EXPECTED = {
     ),
     "adjoint": (diffrax.AbstractAdjoint, "a diffrax adjoint such as diffrax.ForwardMode()"),
     "event": (
-        (diffrax.Event, Jump, type(None)),
-        "a diffrax.Event(condition), which ends the solve, or a dae_jax.Jump(condition, jump), after which it goes on",
+        (diffrax.Event, Reset, type(None)),
+        "a diffrax.Event(condition), which ends the solve, or a dae_jax.Reset(condition, reset), after which it goes on",
     ),
     "progress_meter": (diffrax.AbstractProgressMeter, "a progress meter such as diffrax.TqdmProgressMeter()"),
 }

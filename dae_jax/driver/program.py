@@ -24,7 +24,7 @@ from ..validate.user_functions import refuse_wrong_functions, returned
 from .diffrax_call import Decode, View, call
 from .outcome import judged
 from .problem import Problem, Program, Split, split
-from .resets import Jump, refuse_wrong_event, solve_with_jumps
+from .resets import Reset, refuse_wrong_event, solve_with_resets
 from .start import saved_parts
 from .trajectory_adjoint import Taped, can_be_taped, cotangents, recorded, saved_times
 
@@ -47,7 +47,7 @@ def _jitted(program: Program, arrays: Arrays) -> Any:
     solve, problem = program.whole(jax.tree.map(jnp.asarray, arrays))
     waiting.begin(always=not isinstance(solve.progress_meter, diffrax.NoProgressMeter))
     solve.refuse_wrong_functions(problem)
-    sol, as_expected = solve_with_jumps(solve, problem) if isinstance(solve.event, Jump) else solve(problem)
+    sol, as_expected = solve_with_resets(solve, problem) if isinstance(solve.event, Reset) else solve(problem)
     return Split.of(sol), as_expected
 
 
@@ -78,7 +78,7 @@ class Solve(eqx.Module):
     saveat: diffrax.SaveAt
     controller: diffrax.AbstractStepSizeController
     adjoint: diffrax.AbstractAdjoint
-    event: diffrax.Event | Jump | None
+    event: diffrax.Event | Reset | None
     max_steps: int | None = eqx.field(static=True)
     progress_meter: diffrax.AbstractProgressMeter
 

@@ -16,7 +16,7 @@ from ..solution import RESULTS, DAESolution
 from ..solve import daesolve
 from ..solvers import DOP853, OrthogonalProjection
 from ..systems import ConstrainedSystem
-from ..types import Args, IntScalar, State, Time
+from ..types import Args, IntScalar, Solver, State, Time
 
 
 # The loss of a solve that fails: above all that a solve which succeeds can have.
@@ -66,7 +66,7 @@ class BaumgarteLoss:
     times: Float[np.ndarray, " times"] = dataclasses.field(repr=False)
     dt0: float
     reference: Any = dataclasses.field(repr=False)
-    solver: diffrax.AbstractSolver
+    solver: Solver
     weights: tuple[float, float, float]
 
     def __call__(self, params: dict[str, Any]) -> Float[Array, ""]:
@@ -134,7 +134,7 @@ class BaumgarteLoss:
     def _solve(
         self,
         params: dict[str, Any],
-        solver: diffrax.AbstractSolver,
+        solver: Solver,
         h: Time | None,
         y0: State,
         times: Array | np.ndarray,
@@ -159,7 +159,7 @@ def baumgarte_loss(
     *,
     dt0: float,
     args: Args = None,
-    solver: diffrax.AbstractSolver = diffrax.Tsit5(),  # noqa: B008
+    solver: Solver = diffrax.Tsit5(),  # noqa: B008
     reference: Callable[[np.ndarray], Any] | None = None,
     weights: tuple[float, float, float] = (1.0, 1.0, 1.0),
     times: int = 100,

@@ -12,7 +12,7 @@ from ..diagnostics import drift, energy
 from ..solution import RESULTS, DAESolution
 from ..solve import daesolve
 from ..systems import ConstrainedSystem, System
-from ..types import Args, State, Time
+from ..types import Args, Solver, State, Time
 
 
 def final_state(sol: DAESolution) -> Any:
@@ -59,7 +59,7 @@ def first_flip(ts: Float[Array, " times"], arm: Float[Array, "times 2"]) -> Floa
 
 def lyapunov(
     system: ConstrainedSystem,
-    solver: diffrax.AbstractSolver,
+    solver: Solver,
     t0: Time,
     t1: Time,
     y0: State,

@@ -24,6 +24,7 @@ from jaxtyping import PyTree
 from ..compiler import processors
 from ..driver.failures import sentence_of
 from ..solution import RESULTS
+from ..types import State
 from ..validate.states import brief
 from .progress import Progress
 from .sweep_store import Memory, Store
@@ -60,7 +61,7 @@ class Grid:
         }
 
 
-def grid(**axes: ArrayLike) -> Grid:
+def grid(**axes: ArrayLike | Sequence[float]) -> Grid:
     """A grid for `sweep`: `grid(alpha=..., beta=...)`. The function gets {"alpha": α, "beta": β}, the results have a
     leading axis for each name, in this order.
 
@@ -76,14 +77,14 @@ def grid(**axes: ArrayLike) -> Grid:
 
 
 def sweep(
-    fn: Callable[[Any], PyTree],
-    inputs: PyTree | Grid,
+    fn: Callable[[Any], State],
+    inputs: State | Grid,
     *,
     chunk_size: int | None = None,
     devices: Sequence[Device] | None = None,
     progress: bool = True,
     store: str | os.PathLike[str] | None = None,
-) -> PyTree:
+) -> Any:
     """fn(element) for every element along the leading axis of `inputs`.
 
     **Arguments**

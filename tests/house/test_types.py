@@ -23,7 +23,7 @@ def annotations(source: str) -> Iterator[ast.expr | None]:
             yield from (x.annotation for x in every if x.arg not in ("self", "cls"))
 
 
-def names(annotation: ast.expr | None) -> set[str]:
+def names(annotation: ast.AST | None) -> set[str]:
     found = ast.walk(annotation) if annotation else ()
     return {n.id if isinstance(n, ast.Name) else n.attr for n in found if isinstance(n, ast.Name | ast.Attribute)}
 
@@ -56,3 +56,21 @@ def test_one_parameter_in_ten_is_of_any_type_at_most():
     assert sum(map(says_nothing, every)) / len(every) <= 0.1
     of_the_user = sum(bool(names(x)) and names(x) <= OF_THE_USER | CONTAINERS | {"None"} for x in every)
     assert of_the_user / len(every) <= 0.1
+
+
+def public_names() -> set[str]:
+    """What `dae_jax/__init__.py` imports by its own name, and the modules and the version that it looks up."""
+    tree = ast.parse((PACKAGE / "__init__.py").read_text())
+    imported = {a.name for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) for a in n.names if a.asname == a.name}
+    return imported | {"__version__"}
+
+
+def test_every_public_name_is_used_in_the_file_that_pyright_reads_strictly():
+    source = (Path(__file__).parent / "typed_use.py").read_text()
+    assert source.startswith("# pyright: strict")
+    missing = (
+        public_names()
+        - names(ast.parse(source))
+        - {a.name for n in ast.walk(ast.parse(source)) if isinstance(n, ast.ImportFrom) for a in n.names}
+    )
+    assert not missing
