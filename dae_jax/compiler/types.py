@@ -4,7 +4,7 @@ JAX types the aval of a variable as `AbstractValue`, which has no shape; these s
 """
 
 from collections.abc import Hashable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, cast, runtime_checkable
 
 import numpy as np
 from jax import Array
@@ -22,6 +22,7 @@ Atom: TypeAlias = Var | Literal
 DType: TypeAlias = np.dtype | type
 
 
+@runtime_checkable
 class Aval(Protocol):
     """The shape and the type of an array."""
 

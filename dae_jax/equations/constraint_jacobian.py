@@ -7,7 +7,7 @@ the other methods; `ode` is the `MechanicalODE` that the constraints belong to.
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +30,7 @@ SPARSE_FROM = 5
 Rank = tuple[int, int]
 
 
+@runtime_checkable
 class Mechanism(Protocol):
     """What is asked of a `MechanicalODE`."""
 

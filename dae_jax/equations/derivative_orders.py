@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -47,7 +47,7 @@ class Combination:
         """What F̄ₗ is made of."""
         return dict(self.rows).get(equation, ((equation, 0, 1.0),))
 
-    def of(self, levels: list[Float[Array, " n"]]) -> list[Float[Array, " n"]]:
+    def of(self, levels: list[Float[Array, "n *k"]]) -> list[Float[Array, "n *k"]]:
         """F̄, dF̄/dt, … of F, dF/dt, …: as many fewer as the degree."""
         if not self.rows:
             return levels
@@ -91,6 +91,7 @@ class Offsets:
         return jacobian_pattern(self.signature, self.sigma.equation_offsets, self.sigma.variable_offsets)
 
 
+@runtime_checkable
 class Form(Protocol):
     """What is asked of 0 = F(t, y, ẏ). `may_cancel`: whether highest derivatives may cancel between equations."""
 
@@ -182,7 +183,7 @@ class Slopes:
         self.form, self.degree, self.dtype = form, degree, dtype
         self.shape = (degree + 2, form.size)
 
-    def along(self, t: Scalar, orders: Float[Array, "orders n"]) -> Float[Array, "directions degree+1 n"]:
+    def along(self, t: Scalar, orders: Float[Array, "orders n"]) -> Float[Array, "directions levels n"]:
         """The directional derivatives at t and (y, ẏ, …)."""
         levels = lambda orders: jnp.stack(total_derivatives(self.form.residual, t, list(orders), self.degree + 1))
         directions = np.kron(np.eye(self.shape[0]), seed_matrix(self.colours).T).reshape(-1, *self.shape)

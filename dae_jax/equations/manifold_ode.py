@@ -7,7 +7,7 @@ and their hidden derivatives.
 import abc
 import functools
 from collections.abc import Callable, Hashable
-from typing import Any, Protocol, TypeAlias, TypeVar
+from typing import Any, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -24,6 +24,7 @@ Normals: TypeAlias = Array | tuple[Array, ...]
 Feedback: TypeAlias = Callable[..., Array]
 
 
+@runtime_checkable
 class Equations(Protocol):
     """What the solver gets as diffrax's `args`: a system at one instant, which knows the user's structure."""
 
