@@ -74,11 +74,11 @@ def fixed_point(
     """
     dtype = jnp.result_type(*jax.tree.leaves(x))
     tolerance = roundoff(dtype)
-    # Near a singular point round-off is amplified so much that corrections end below this without shrinking to less.
-    noise = float(jnp.finfo(dtype).eps) ** 0.55
     one = jnp.ones((), dtype)
-
     proves_nothing = last is None
+    # Near a singular point round-off is amplified so much that corrections end below this without shrinking to less.
+    # So they do where an equation is steep, and there they are no proof.
+    noise = 0.0 if proves_nothing else float(jnp.finfo(dtype).eps) ** 0.55
 
     def unfinished(carry: Any) -> Bool[Array, ""]:
         _, last, previous, count = carry
