@@ -3,7 +3,7 @@
 import jax
 from jaxtyping import install_import_hook
 
-import tests.typechecker as _  # the hook looks it up
+import tests.typechecker  # noqa: F401  # the hook looks it up
 
 
 jax.config.update("jax_enable_x64", True)

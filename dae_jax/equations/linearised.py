@@ -128,7 +128,7 @@ class LinearisedResidual(eqx.Module):
         along = lambda seed: jax.jvp(of, (point[argument],), (seed,))[1]
         return compression.entries(jax.vmap(along)(jnp.asarray(compression.seeds, point[1].dtype)))
 
-    def factor(self, j: Array, m: Array, c: Time, h: Time) -> tuple[Any, Float[Array, ""]]:
+    def factor(self, j: Array, m: Array, c: Inexact[Array, ""], h: Time) -> tuple[Any, Float[Array, ""]]:
         """The factors of J + c M, for c of the order of 1/h, and the smallest pivot, of round-off size for a singular one.
 
         With column j scaled by h^dⱼ, the rows tend with h → 0 to those of the Σ-method's system Jacobian, however high the
@@ -139,6 +139,10 @@ class LinearisedResidual(eqx.Module):
         factors, smallest = self.storage.factor(matrix)
         return (factors, scale, c), smallest
 
+    def round_off(self, j: Array, m: Array, c: Inexact[Array, ""], size: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The round-off of each equation, (|J| + |c M|) ε, for variables of that `size`."""
+        return self.storage.apply(jnp.abs(j) + jnp.abs(c * m), size) * jnp.finfo(size.dtype).eps
+
     def column_scale(self, h: Time) -> Float[Array, " n"]:
         """h^dⱼ."""
         return powers(jnp.minimum(jnp.abs(h), 1), self.structure.offsets)
@@ -148,7 +152,7 @@ class LinearisedResidual(eqx.Module):
         inner, scale, c = factors
         return scale * self.storage.solve(inner, self._combined(b, c))
 
-    def _combined(self, rows: Array, c: Time) -> Any:
+    def _combined(self, rows: Array, c: Inexact[Array, ""]) -> Any:
         """Rows, or right-hand sides, in the combination in which highest derivatives do not cancel, with c for d/dt."""
         combination = self.structure.combination
         return combination.of([rows * c**k if k else rows for k in range(combination.degree + 1)])[0]
