@@ -8,7 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Inexact
 
 from ..compiler import Polynomial, polynomials
 from ..structure import (
@@ -47,7 +47,7 @@ class Combination:
         """What F̄ₗ is made of."""
         return dict(self.rows).get(equation, ((equation, 0, 1.0),))
 
-    def of(self, levels: list[Float[Array, "n *k"]]) -> list[Float[Array, "n *k"]]:
+    def of(self, levels: list[Inexact[Array, "n *k"]]) -> list[Inexact[Array, "n *k"]]:
         """F̄, dF̄/dt, … of F, dF/dt, …: as many fewer as the degree."""
         if not self.rows:
             return levels

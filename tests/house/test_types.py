@@ -1,6 +1,8 @@
 """What parameters are called: how many are of any type, and how many of these are pytrees of the user's."""
 
 import ast
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -74,3 +76,11 @@ def test_every_public_name_is_used_in_the_file_that_pyright_reads_strictly():
         - {a.name for n in ast.walk(ast.parse(source)) if isinstance(n, ast.ImportFrom) for a in n.names}
     )
     assert not missing
+
+
+def test_shapes_and_types_are_as_the_annotations_say():
+    """In a process of its own, since the annotations are checked from the import on."""
+    ran = subprocess.run(
+        [sys.executable, "-m", "tests.checked_shapes"], cwd=PACKAGE.parent, capture_output=True, text=True
+    )
+    assert ran.returncode == 0, ran.stderr[-3000:]
