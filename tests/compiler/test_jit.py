@@ -322,7 +322,9 @@ class TestWhatJaxIsToldForDebugging:
 ALIKE = (np.array(0.1234567890123), np.array(0.1234567891))
 
 
-@pytest.mark.parametrize("a, b", [ALIKE, np.float32(ALIKE), (np.array(0.0), np.array(-0.0)), (np.array(7), np.array(7.0))])
+@pytest.mark.parametrize(
+    ("a", "b"), [ALIKE, np.float32(ALIKE), (np.array(0.0), np.array(-0.0)), (np.array(7), np.array(7.0))]
+)
 def test_numbers_that_look_alike_are_told_apart(only_ours, a, b):
     def both(x):
         return jnp.stack([jnp.copysign(x, a * x), jnp.copysign(x, b * x), x * a, x * b, x + a, x + b])
