@@ -1,0 +1,137 @@
+"""What must hold of a batch of random mechanisms: each check gives the lines that say what does not."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from . import solves
+from .mechanisms import (
+    FAMILIES,
+    NEAR_SINGULAR,
+    T1,
+    conditioning,
+    constraint_jacobian,
+    energy,
+    mass_matrix,
+    mechanism,
+    off_constraints,
+    power,
+    scaled,
+)  # fmt: skip
+
+
+class Batch:
+    """Mechanisms of a family, their solves by the method that the others are compared with, and which pass near a dead centre."""
+
+    def __init__(self, name: str, seeds: Sequence[int]):
+        self.name, self.seeds = name, list(seeds)
+        self.each = [mechanism(FAMILIES[name], seed) for seed in self.seeds]
+        self.p = jax.tree.map(lambda *x: np.stack(x), *self.each)
+        self.q, self.v, self.code, self.multipliers = solves.batch(name, "projection", self.p)
+        self.size = 1 + np.abs(self.v).max((1, 2, 3)) + np.abs(self.q).max((1, 2, 3))
+        worst = np.array([self._worst(p, q) for p, q in zip(self.each, self.q, strict=True)])
+        # What ended may not have been saved near where it ended.
+        self.near = worst < np.where(self.code == 0, 1, 10) * NEAR_SINGULAR
+
+    @staticmethod
+    def _worst(p: Any, qs: np.ndarray) -> float:
+        """The conditioning of the constraints where they are worst; times that a solve did not reach are left out."""
+        inverse = np.linalg.inv(mass_matrix(p))
+        reached = [(T1 * x, q) for x, q in zip(solves.NODES, qs, strict=True) if np.isfinite(q).all()]
+        return min(conditioning(constraint_jacobian(p, t, q), inverse) for t, q in reached)
+
+    def beyond(self, what: str, off: np.ndarray, allowed: float) -> list[str]:
+        """A line for each mechanism whose number is larger, or none at all."""
+        wrong = ~(off <= allowed) & ~self.near
+        return [
+            f"{self.name} {s}: {what} {x:.2g} > {allowed:.2g}"
+            for s, x in zip(np.array(self.seeds)[wrong], off[wrong], strict=True)
+        ]
+
+    def differ(self, what: str, others: Any, allowed: float) -> list[str]:
+        q, v = others
+        off = np.maximum(np.abs(q - self.q).max((1, 2, 3)), np.abs(v - self.v).max((1, 2, 3)))
+        return self.beyond(what, off / self.size, allowed)
+
+
+def ends_well(b: Batch) -> list[str]:
+    return b.beyond("a result code", b.code.astype(float), 0)
+
+
+def stays_on_the_constraints(b: Batch, method: str = "projection", allowed: float = 1e-11) -> list[str]:
+    q, v, *_ = solves.batch(b.name, method, b.p)
+    off = np.array(
+        [
+            np.max([off_constraints(p, T1 * x, *y) for x, *y in zip(solves.NODES, *ys, strict=True)])
+            for p, *ys in zip(b.each, q, v, strict=True)
+        ]
+    )  # fmt: skip
+    return b.beyond(f"off the constraints ({method})", off / b.size, allowed)
+
+
+def balances_its_energy(b: Batch) -> list[str]:
+    """What is gained is the work of drag and of what drives the joints."""
+    off = []
+    for p, q, v, m in zip(b.each, b.q, b.v, b.multipliers, strict=True):
+        powers = [power(p, T1 * x, *y) for x, *y in zip(solves.NODES, q, v, m, strict=True)]
+        work = T1 * solves.WEIGHTS @ powers[1:-1]
+        scale = 1 + abs(energy(p, q[0], v[0])) + T1 * np.max(np.abs(powers))
+        off.append(abs(energy(p, q[-1], v[-1]) - energy(p, q[0], v[0]) - work) / scale)
+    return b.beyond("off the balance of energy", np.array(off), 1e-7)
+
+
+def agrees(b: Batch, method: str) -> list[str]:
+    q, v, code, _ = solves.batch(b.name, method, b.p)
+    failed = b.beyond(f"a result code ({method})", code.astype(float), 0)
+    return failed + b.differ(f"{method} differs from projection by", (q, v), 1000 * solves.METHODS[method][2])
+
+
+def comes_back(b: Batch) -> list[str]:
+    """Backwards from the end."""
+    q, v, *_ = solves.batch(b.name, "projection", b.p | {"q": b.q[:, -1], "v": b.v[:, -1]}, T1, 0.0)
+    # Gauss's nodes lie symmetrically.
+    return b.differ("backwards differs by", (q[:, ::-1], v[:, ::-1]), 1e-6)
+
+
+def scales(b: Batch) -> list[str]:
+    """Other units of mass, length and time: the same motion."""
+    units = np.array([10 ** np.random.default_rng([7, s]).uniform(-3, 3, 3) for s in b.seeds]).T
+    _, length, time = units
+    small = np.minimum(length, length / time)
+    q, v, *_ = solves.batch(b.name, "projection", scaled(b.p, *units), 0.0, T1 * time, small)
+    wide = lambda x: x[:, None, None, None]
+    return b.differ("in other units differs by", (q / wide(length), v / wide(length / time)), 1e-6)
+
+
+def batch_is_one_at_a_time(b: Batch, count: int = 5) -> list[str]:
+    lines = []
+    for k in range(0, len(b.seeds), max(1, len(b.seeds) // count)):
+        q, v, code, _ = solves.alone(b.name, "projection", b.each[k])
+        off = max(np.abs(q - b.q[k]).max(), np.abs(v - b.v[k]).max()) / b.size[k]
+        if not (off <= 1e-9 and code == b.code[k]) and not b.near[k]:
+            lines.append(f"{b.name} {b.seeds[k]}: alone differs from a lane of the batch by {off:.2g}")
+    return lines
+
+
+def derives(b: Batch, method: str = "projection") -> list[str]:
+    """Both modes are central differences."""
+    drawn = [np.random.default_rng([8, s]) for s in b.seeds]
+    direction = {key: np.stack([r.uniform(-1, 1, x.shape[1:]) * x[0] for r, x in zip(drawn, np.split(b.p[key], len(drawn)), strict=True)])
+                 for key in solves.TUNED}  # fmt: skip
+    weights = tuple(np.stack([r.normal(size=b.q.shape[2:]) for r in drawn]) for _ in "qv")
+    reverse, forward = (np.asarray(x) for x in solves.derivatives(b.name, method)(b.p, direction, weights))
+    h, ends = 1e-4, []
+    for sign in (1, -1):
+        moved = b.p | {key: b.p[key] + sign * h * direction[key] for key in solves.TUNED}
+        q, v, *_ = solves.batch(b.name, method, moved)
+        ends.append(np.sum(weights[0] * q[:, -1], (1, 2)) + np.sum(weights[1] * v[:, -1], (1, 2)))
+    central = (ends[0] - ends[1]) / (2 * h)
+    size = b.size * (1 + np.abs(central))
+    return b.beyond("reverse differs from forward mode by", np.abs(reverse - forward) / size, 1e-7) + b.beyond(
+        "forward mode differs from central differences by", np.abs(forward - central) / size, 1e-5
+    )
+
+
+Check = Callable[[Batch], list[str]]
