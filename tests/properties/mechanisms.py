@@ -1,6 +1,7 @@
 """Random trees and loops of point masses and rods, with springs, drag and driven joints, as arrays: a batch is one program."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
@@ -101,9 +102,9 @@ def _drawn(family: Family, rng: np.random.Generator) -> dict[str, Any]:
 
 def system(family: Family, p: Any) -> dae_jax.ConstrainedSystem:
     """M v̇ = f − Gᵀλ, 0 = (|s|² − ℓ(t)²)/2 for each rod, s = B q − a(t); the potential of a spring is k (|s|² − ℓ²)²/(8 ℓ²)."""
-    weights = p["mass"] + jnp.abs(p["rods"]).T @ p["rod mass"] / 2
 
     def force(t: Any, q: Any, v: Any, p: Any) -> Any:
+        weights = p["mass"] + jnp.abs(p["rods"]).T @ p["rod mass"] / 2
         s = p["springs"] @ q - p["hooks"]
         pull = p["stiffness"] * (jnp.sum(s**2, 1) / p["rest"] ** 2 - 1) / 2
         drag = p["drag"] + p["cubic drag"] * jnp.sum(v**2, 1)
@@ -199,3 +200,23 @@ def scaled(p: Any, mass: Any, length: Any, time: Any) -> dict[str, Any]:
         [u**e for u, e in zip((mass, length, time), _DIMENSIONS[name], strict=True)], 0
     ).reshape(-1, *[1] * (np.ndim(x) - 1))
     return {name: x * factor(name, x) if name in _DIMENSIONS else x for name, x in p.items()}
+
+
+def in_another_frame(p: Any, seed: int) -> tuple[dict[str, Any], Callable[[np.ndarray], np.ndarray]]:
+    """The same mechanism, its masses, rods and springs in another order, in a frame that is turned, mirrored and shifted; and
+    the way of velocities into that frame (of positions, less the shift, which is 1 along each axis).
+    """
+    rng = np.random.default_rng([9, seed])
+    masses, rods, springs = (rng.permutation(len(p[name])) for name in ("mass", "rods", "springs"))
+    turn, _ = np.linalg.qr(rng.normal(size=(p["q"].shape[1],) * 2))
+    turned = lambda x: x[..., masses, :] @ turn
+    moved = {
+        "mass": p["mass"][masses], "drag": p["drag"][masses], "cubic drag": p["cubic drag"][masses],
+        "rods": p["rods"][rods][:, masses], "springs": p["springs"][springs][:, masses],
+        "anchors": p["anchors"][rods] @ turn + p["rods"][rods].sum(1)[:, None],
+        "hooks": p["hooks"][springs] @ turn + p["springs"][springs].sum(1)[:, None],
+        "rod mass": p["rod mass"][rods], "length": p["length"][rods], "breath": p["breath"][rods],
+        "drive": p["drive"][rods] @ turn, "stiffness": p["stiffness"][springs], "rest": p["rest"][springs],
+        "gravity": p["gravity"] @ turn, "q": turned(p["q"]) + 1, "v": turned(p["v"]),
+    }  # fmt: skip
+    return p | moved, turned
