@@ -62,6 +62,37 @@ def test_multipliers_of_unequal_masses(links, shape):
     np.testing.assert_allclose(dae_jax.multipliers(system, 0.0, q, v), expected, rtol=1e-9)
 
 
+@pytest.mark.parametrize("form", ["index-3", "index-2", "GGL"])
+def test_residual_forms_of_unequal_masses(form):
+    """At any q, v, λ, η and rates, against numpy: a force, a constraint and its rate that depend on time, a full mass matrix."""
+    rng = np.random.default_rng(5)
+    root, t, (q, v, qd, vd) = rng.normal(size=(3, 3)), 0.3, rng.normal(size=(4, 3))
+    mass, f, normal = root @ root.T + np.eye(3), rng.normal(size=3), q + np.array([0, 0, 2])
+    system = dae_jax.ConstrainedSystem(
+        lambda t, q, v, args: t * jnp.asarray(f) - v,
+        lambda t, q, args: (jnp.sum(q**2) + 4 * q[2] - 1 - t**3) / 2,
+        mass,
+    )
+    y, yd = np.concatenate([q, v, [0.7]]), np.concatenate([qd, vd, [0.0]])
+    if form == "GGL":
+        y, yd = np.append(y, 0.9), np.append(yd, 0.0)
+    g, rate = (q @ q + 4 * q[2] - 1 - t**3) / 2, normal @ v - 3 * t**2 / 2
+    momentum = mass @ vd - (t * f - v) + 0.7 * normal
+    expected = {
+        "index-3": [qd - v, momentum, [g]],
+        "index-2": [qd - v, momentum, [rate]],
+        "GGL": [mass @ (qd - v) + 0.9 * normal, momentum, [rate], [g]],
+    }[form]
+    found = ResidualForm.of(system, t, (q, v), None, form)
+    np.testing.assert_allclose(found.residual(t, y, yd), np.concatenate(expected), rtol=1e-13)
+    # The multiplier that a solve starts with balances the momentum: n·v̇ + v·v − 3 t = 0 and M v̇ + n λ = t f − v.
+    bordered = np.block([[mass, normal[:, None]], [normal, np.zeros(1)]])
+    acceleration = np.linalg.solve(bordered, [*(t * f - v), 3 * t - v @ v])[:3]
+    start, at = found.at_start(t, (q, v))
+    rates = np.concatenate([qd, acceleration, np.zeros(len(at) - 6)])
+    np.testing.assert_allclose(start.residual(t, at, rates)[3:6], 0, atol=1e-12)
+
+
 def test_nested_derivatives_are_taylors():
     """Along y = y₀ + s ẏ + s²/2 ÿ + s³/6 y⃛: what takes the place of Taylor arithmetic gives the same."""
     residual = lambda t, y, yd: jnp.stack([y[0] * yd[1] + t * y[1] ** 2, jnp.exp(y[0]) - yd[0] ** 2])

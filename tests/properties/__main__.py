@@ -1,4 +1,5 @@
-"""python -m tests.properties FIRST LAST [--everything]: the mechanisms of these seeds, of each family, and what does not hold.
+"""python -m tests.properties FIRST LAST [--everything]: the mechanisms of these seeds, of each family, DAEs
+whose solution was chosen, and what does not hold.
 
 By default what the tests ask of each family; `--everything`: every method and derivatives of every family, which takes minutes to
 compile.
@@ -17,7 +18,8 @@ TOGETHER = 170
 
 
 def main(first: int, last: int, everything: bool) -> int:
-    from .campaign import EVERYTHING, FAMILY_CHECKS
+    from . import manufactured
+    from .campaign import EVERYTHING, FAMILY_CHECKS, broken
     from .checks import Batch
 
     jax.config.update("jax_enable_x64", True)
@@ -26,11 +28,16 @@ def main(first: int, last: int, everything: bool) -> int:
         # Batches of one size, so that nothing is compiled again.
         for start in range(first, last, TOGETHER):
             batch = Batch(name, range(start, start + TOGETHER))
-            lines = [line for check in (EVERYTHING if everything else checks) for line in check(batch)]
+            lines = broken(batch, EVERYTHING if everything else checks)
             count, near, failed = count + TOGETHER, near + int(batch.near.sum()), failed + len(lines)
             print(*lines, sep="\n", end="\n" if lines else "")
             print(f"{name}: {count} mechanisms, {near} of them near a dead centre, {failed} lines", flush=True)
         jax.clear_caches()
+    for index in (1, 2, 3):
+        for method in manufactured.METHODS if everything else ("projection",):
+            lines = manufactured.broken(index, range(first, last), method, derivatives=everything and index < 3)
+            failed += len(lines)
+            print(*lines, f"index {index} by {method}: {last - first} DAEs, {len(lines)} lines", sep="\n", flush=True)
     return failed
 
 

@@ -1,11 +1,12 @@
-"""Mechanisms put together at random: `python -m tests.properties FIRST LAST` solves those of other seeds."""
+"""Mechanisms and DAEs put together at random: `python -m tests.properties FIRST LAST` solves those of other seeds."""
 
 import os
 import secrets
 
 import pytest
 
-from .campaign import FAMILY_CHECKS, FIXED, FOUND
+from . import manufactured
+from .campaign import FAMILY_CHECKS, FIXED, FOUND, broken
 from .checks import Batch
 
 
@@ -34,5 +35,11 @@ def test_few_are_near_a_dead_centre(batch):
 
 
 def test_what_must_hold(batch):
-    lines = [line for check in FAMILY_CHECKS[batch.name] for line in check(batch)]
+    lines = broken(batch, FAMILY_CHECKS[batch.name])
+    assert not lines, "\n".join(lines)
+
+
+@pytest.mark.parametrize(("index", "method", "derivatives"), [(1, "projection", False), (2, "projection", True)])
+def test_daes_have_the_solution_that_was_chosen(new_seed, index, method, derivatives):
+    lines = manufactured.broken(index, [*range(20), *range(new_seed, new_seed + 10)], method, derivatives)
     assert not lines, "\n".join(lines)
