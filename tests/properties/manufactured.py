@@ -87,21 +87,28 @@ def ends(index: int, method: str) -> Any:
 
 @functools.lru_cache
 def gradients(index: int, method: str) -> Any:
-    """Of a batch, the gradient of weights·y(T1) with respect to all numbers of the system."""
-    weighted = lambda p, weights: jnp.dot(weights, _end(index, method, p)[0])
-    return eqx.filter_jit(jax.vmap(jax.grad(weighted)))
+    """The same, and the gradient of weights·y(T1) with respect to all numbers of the system."""
+
+    def weighted(p: Any, weights: Any) -> Any:
+        y, code = _end(index, method, p)
+        return jnp.dot(weights, y), (y, code)
+
+    def both(p: Any, weights: Any) -> Any:
+        gradient, (y, code) = jax.grad(weighted, has_aux=True)(p, weights)
+        return y, code, gradient
+
+    return eqx.filter_jit(jax.vmap(both))
 
 
 def broken(index: int, seeds: Any, method: str = "projection", derivatives: bool = False) -> list[str]:
     """A line for each system that does not end where it should or whose derivatives are others than those of y*(T1)."""
     each = [drawn(index, seed) for seed in seeds]
     p = jax.tree.map(lambda *x: np.stack(x), *each)
-    y, code = (np.asarray(x) for x in ends(index, method)(p))
+    weights = np.stack([np.random.default_rng([4, s]).normal(size=DIFFERENTIAL + ALGEBRAIC) for s in seeds])
+    y, code, *found = gradients(index, method)(p, weights) if derivatives else ends(index, method)(p)
     off = np.abs(y - exact(p, T1)[0]).max(1)
-    laws = [("a result code", code, 0), ("off the solution", off, 1000 * TOLERANCE)]
-    if derivatives:
-        weights = np.stack([np.random.default_rng([4, s]).normal(size=y.shape[1]) for s in seeds])
-        found = gradients(index, method)(p, weights)
+    laws = [("a result code", np.asarray(code), 0), ("off the solution", off, 1000 * TOLERANCE)]
+    for gradient in found:
         angle = p["frequency"] * T1 + p["phase"]
         turned = weights * p["amplitude"] * np.cos(angle)
         # Nothing else moves the solution.
@@ -111,7 +118,7 @@ def broken(index: int, seeds: Any, method: str = "projection", derivatives: bool
         # A small unit is a number whose derivative is large.
         size = {key: np.abs(p["unit"]) if key == "unit" else 1.0 for key in p}
         for key in p:
-            wrong = np.abs(np.asarray(found[key]) - wanted[key]) * size[key]
+            wrong = np.abs(np.asarray(gradient[key]) - wanted[key]) * size[key]
             laws.append((f"derivative by {key} off by", wrong.reshape(len(seeds), -1).max(1), 1e-6))
     return [
         f"index {index} {method} {seed}: {what} {x:.2g}"

@@ -91,18 +91,18 @@ TUNED = "mass", "stiffness", "drag", "gravity"
 
 
 @functools.lru_cache
-def derivatives(name: str, method: str) -> Any:
-    """Of a batch, the derivatives of a weighted end state along `direction`: (reverse, forward)."""
+def derivatives(name: str, method: str, forward: bool) -> Any:
+    """Of a batch, the derivative of a weighted end state along `direction`."""
 
     def weighted(x: Any, p: Any, weights: Any, adjoint: Any) -> Any:
         q, v, _ = _end(name, method, p | x, adjoint)
         return jnp.sum(weights[0] * q) + jnp.sum(weights[1] * v)
 
-    def both(p: Any, direction: Any, weights: Any) -> Any:
+    def along(p: Any, direction: Any, weights: Any) -> Any:
         x = {key: p[key] for key in TUNED}
+        if forward:
+            return jax.jvp(lambda x: weighted(x, p, weights, diffrax.ForwardMode()), (x,), (direction,))[1]
         reverse = jax.grad(weighted)(x, p, weights, diffrax.RecursiveCheckpointAdjoint())
-        forward = lambda x: weighted(x, p, weights, diffrax.ForwardMode())
-        along = sum(jnp.sum(reverse[key] * direction[key]) for key in TUNED)
-        return along, jax.jvp(forward, (x,), (direction,))[1]
+        return sum(jnp.sum(reverse[key] * direction[key]) for key in TUNED)
 
-    return eqx.filter_jit(jax.vmap(both))
+    return eqx.filter_jit(jax.vmap(along))
