@@ -93,6 +93,30 @@ def test_residual_forms_of_unequal_masses(form):
     np.testing.assert_allclose(start.residual(t, at, rates)[3:6], 0, atol=1e-12)
 
 
+def test_rolling_is_a_constraint_of_velocities():
+    """h = v₀ q₁ − v₁ (1 + q₀²), M v̇ = f − hᵥᵀμ, hᵥ v̇ = −(hᵩ v): μ against numpy."""
+    masses, f = np.array([2.0, 5.0]), np.array([1.0, -3.0])
+    q, v = np.array([0.4, 0.7]), np.array([1.16, 0.7])
+    rolling = lambda t, q, v, args: v[0] * q[1] - v[1] * (1 + q[0] ** 2)
+    system = dae_jax.ConstrainedSystem(lambda t, q, v, args: jnp.asarray(f), None, masses, nonholonomic=rolling)
+    row = np.array([q[1], -(1 + q[0] ** 2)])
+    bias = -v[1] * 2 * q[0] * v[0] + v[0] * v[1]
+    expected = (row @ (f / masses) + bias) / (row @ (row / masses))
+    np.testing.assert_allclose(dae_jax.multipliers(system, 0.0, q, v), [expected], rtol=1e-13)
+
+
+def test_consistent_velocities_keep_what_is_fixed():
+    """On the circle with v₀ kept, v₁ follows from q·v = 0; with none kept, v is moved by M⁻¹q."""
+    q, v, masses = np.array([0.6, 0.8]), np.array([1.0, 2.0]), np.array([1.0, 4.0])
+    system = dae_jax.ConstrainedSystem(lambda t, q, v, args: 0 * q, lambda t, q, args: (jnp.sum(q**2) - 1) / 2, masses)
+    kept = np.array([True, False])
+    _, found = dae_jax.consistent_state(system, 0.0, (q, v), fixed=(np.zeros(2, bool), kept))
+    np.testing.assert_allclose(found, [1.0, -0.75], rtol=1e-12)
+    _, nearest = dae_jax.consistent_state(system, 0.0, (q, v))
+    normal = q / masses
+    np.testing.assert_allclose(nearest, v - normal * (q @ v) / (q @ normal), rtol=1e-12)
+
+
 def test_nested_derivatives_are_taylors():
     """Along y = y₀ + s ẏ + s²/2 ÿ + s³/6 y⃛: what takes the place of Taylor arithmetic gives the same."""
     residual = lambda t, y, yd: jnp.stack([y[0] * yd[1] + t * y[1] ** 2, jnp.exp(y[0]) - yd[0] ** 2])
