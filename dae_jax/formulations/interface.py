@@ -1,7 +1,7 @@
 """What a formulation is: which equations of a system are integrated, and by which kind of solver."""
 
 import abc
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import diffrax
 import equinox as eqx
@@ -14,6 +14,7 @@ class AbstractFormulation(eqx.Module):
     For those who call `diffrax.diffeqsolve` themselves:
 
         y0, ode = formulation.encode(system, t0, state, args)
+        formulation = formulation.towards(jnp.sign(t1 - t0))
         sol = diffrax.diffeqsolve(formulation.term(), solver, t0, t1, dt0, y0, args=ode)
         state = formulation.decode(t, y, ode)
 
@@ -40,6 +41,10 @@ class AbstractFormulation(eqx.Module):
 
     def refuse(self, system: Any) -> None:
         """Refuses, by a `ValueError` with advice, what the formulation is not for."""
+
+    def towards(self, sign: Any) -> Self:
+        """The formulation for a solve in which time runs forwards, `sign` 1, or backwards, −1."""
+        return self
 
     @abc.abstractmethod
     def encode(self, system: Any, t: Any, state: Any, args: Any = None, rank: Any = None) -> tuple[Any, Any]:
