@@ -11,15 +11,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
+from ..types import DType
 from .dense import solve
 
 
 MAX_STEPS = 20
 
 
-def roundoff(dtype: Any) -> float:
+def roundoff(dtype: DType) -> float:
     """How small the error of a solved unknown is, relative to 1 + its size, when it counts as solved."""
     return 4 * float(jnp.finfo(dtype).eps)
 
@@ -32,7 +33,7 @@ def relative_change(delta: Float[Array, " n"], x: Float[Array, " n"]) -> Float[A
 def newton(
     residual: Callable[[Float[Array, " n"], Any], Float[Array, " n"]],
     x0: Float[Array, " n"],
-    params: Any,
+    params: PyTree,
     *,
     linear_solve: Callable[[Float[Array, "n n"], Float[Array, " n"]], Float[Array, " n"]] = solve,
     max_steps: int = MAX_STEPS,
@@ -46,10 +47,10 @@ def newton(
     −(∂F/∂x)⁻¹ ∂F/∂params dparams, in both modes and to any order; `x0` has no derivative.
     """
 
-    def from_start(x: Float[Array, " n"], given: Any) -> Float[Array, " n"]:
+    def from_start(x: Float[Array, " n"], given: PyTree) -> Float[Array, " n"]:
         return residual(x, given[0])
 
-    def iterate(given: Any) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
+    def iterate(given: PyTree) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
         params, start = given
 
         def correct(x: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
@@ -123,7 +124,7 @@ def _inner(a: Any, b: Any) -> Float[Array, ""]:
 def implicit_root(
     residual: Callable[[Float[Array, " n"], Any], Float[Array, " n"]],
     iterate: Callable[[Any], tuple[Float[Array, " n"], Any]],
-    params: Any,
+    params: PyTree,
     *,
     linear_solve: Callable[[Any, Float[Array, " n"]], Float[Array, " n"]] = solve,
     jacobian: Callable[[Float[Array, " n"], Any], Any] | None = None,
@@ -138,11 +139,11 @@ def implicit_root(
     jacobian = jax.jacfwd(residual) if jacobian is None else jacobian
 
     @jax.custom_jvp
-    def find(arrays: Any) -> tuple[Float[Array, " n"], Any]:
+    def find(arrays: PyTree) -> tuple[Float[Array, " n"], Any]:
         return iterate(eqx.combine(arrays, static))
 
     @find.defjvp
-    def _(primals: Any, tangents: Any) -> Any:
+    def _(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
         (arrays,), (directions,) = primals, tangents
         x, outcome = find(arrays)
         _, change = jax.jvp(lambda a: residual(x, eqx.combine(a, static)), (arrays,), (directions,))

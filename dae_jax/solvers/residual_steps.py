@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -12,6 +12,13 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..linalg import rms_norm, roundoff
+
+
+# As equinox has it.
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractClassVar
+else:
+    from equinox import AbstractClassVar
 
 
 # The part of the tolerance that round-off may use up (BCP, section 5.2.2).
@@ -36,8 +43,8 @@ class AbstractResidualSolver(diffrax.AbstractAdaptiveSolver):
     """
 
     # Up to which index the method converges, and takes the equations as they are written where nothing else is asked for.
-    highest_index: eqx.AbstractClassVar[int]
-    default_index: eqx.AbstractClassVar[int]
+    highest_index: AbstractClassVar[int]
+    default_index: AbstractClassVar[int]
     # Which entries of its state at the end of a solve are counts for `stats`.
     counts: ClassVar[tuple[str, ...]] = ()
 
