@@ -38,7 +38,7 @@ def _other(method: str, keeps: bool = True) -> Check:
 FAMILY_CHECKS: dict[str, list[Check]] = {
     "plane tree": [*_ALL, is_the_motion_in_minimal_coordinates, _other("tangent space"), batch_is_one_at_a_time],
     "loop of heavy rods": _ALL,
-    "driven loop in space": [*_ALL, _other("baumgarte", keeps=False), derives],
+    "driven loop in space": [*_ALL, _other("baumgarte", keeps=False)],
 }
 EVERYTHING = [
     *_ALL, *map(_other, ("projection of order 8", "tangent space", "dummy derivatives", "ggl")),
