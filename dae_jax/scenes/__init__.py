@@ -3,6 +3,7 @@
 import functools
 from collections.abc import Callable
 
+from ..systems import System
 from .charge_pump import charge_pump as charge_pump
 from .chemistry import akzo_nobel as akzo_nobel, robertson as robertson
 from .circuits import amplifier as amplifier, capacitor_loop as capacitor_loop
@@ -22,7 +23,7 @@ from .wheelset import wheelset as wheelset
 
 
 # The scenes by their names on the command line, each a function without arguments that makes it.
-SCENES: dict[str, Callable[[], Scene]] = {
+SCENES: dict[str, Callable[[], Scene[System]]] = {
     "akzo-nobel": akzo_nobel,
     "amplifier": amplifier,
     "andrews": andrews,
