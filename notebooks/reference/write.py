@@ -38,7 +38,11 @@ PAGES = {
         "OrthogonalProjection TangentSpace SymmetricProjection Trapezoid Midpoint Gauss4 RATTLE DOP853 RadauIIA5 BDF "
         "AbstractManifoldSolver AbstractResidualSolver",
     ),
-    "starts_and_events": ("Starts and events", "States that satisfy the equations; what interrupts a solve.", "consistent_state Reset Jump"),
+    "starts_and_events": (
+        "Starts and events",
+        "States that satisfy the equations; what interrupts a solve.",
+        "consistent_state Reset Jump",
+    ),
     "diagnostics": ("Diagnostics", "What a solution keeps, and by which forces.", "drift Drift EquationDrift energy multipliers"),
     "structure": (
         "Structure",
