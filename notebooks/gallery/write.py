@@ -27,7 +27,7 @@ from dae_jax.app.figures import figures
 
 HERE = Path(__file__).parent
 NOTEBOOKS = HERE.parent
-WIDTH, HEIGHT = 320, 320  # pixels, at most
+SIZE = 320  # pixels of the longer side
 RTOL = 1e-8
 HEAD = """# Notebooks
 
@@ -49,8 +49,9 @@ This page is written by `python notebooks/gallery/write.py`.
 SCENES_HEAD = f"""# Scenes
 
 Ready systems: `dae_jax.scenes.SCENES["pendulum"]()` is one, `dae-jax compare pendulum` solves it by every method. Each has a
-reference that is independent of the library: a closed form, a tight solve in minimal coordinates by scipy, or a published
-end. The error is the largest against it, at a tolerance of {RTOL:g}, relative where the solution is larger than the scene's scale.
+reference that is independent of the library: a closed form, a tight solve in minimal coordinates by scipy, or a published end.
+The error is the largest against it, at a tolerance of {RTOL:g}, of all entries, multipliers and accelerations too where they are
+unknowns; relative where the solution is larger than the scene's scale.
 """
 
 
@@ -73,7 +74,7 @@ def digest(figure: bytes) -> str:
 def thumbnail(figure: bytes, /, **said: str) -> bytes:
     """A figure, small, with what is said of it in it."""
     image = Image.open(io.BytesIO(figure)).convert("RGB")
-    scale = min(WIDTH / image.width, HEIGHT / image.height)
+    scale = SIZE / max(image.size)
     small = image.resize((round(scale * image.width), round(scale * image.height)), Image.Resampling.LANCZOS)
     words, file = PngInfo(), io.BytesIO()
     for key, value in said.items():

@@ -9,6 +9,7 @@ import pytest
 
 import dae_jax
 from dae_jax._compat import messages
+from dae_jax.app.compare import Row, methods
 
 
 ROOT = Path(__file__).parents[2]
@@ -100,6 +101,36 @@ class TestErrors:
     def test_exceptions_are_raised(self, names):
         for program in programs(ERRORS.split("## Exceptions")[1]):
             exec(program, names)
+
+
+class TestWhichMethod:
+    TEXT = (NOTEBOOKS / "which_method.md").read_text()
+
+    def test_tables_have_every_method_of_their_scene(self):
+        tables = writer("which_method").tables(self.TEXT)
+        assert len(tables) >= 4
+        for name, table in tables.items():
+            rows = re.findall(r"^\| `([\w-]+)`", table, re.MULTILINE)
+            assert rows == list(methods(dae_jax.scenes.SCENES[name]())), "run `python notebooks/which_method/write.py`"
+
+    def test_a_table_is_what_is_measured(self):
+        """Robertson's, whose two solves are short: steps and errors are those of the page."""
+        kept, found = (
+            re.findall(r"^\| `([\w-]+)` \| (\d+) \|.*?\|.*?\| (\S+) \|", table, re.MULTILINE)
+            for table in (
+                writer("which_method").tables(self.TEXT)["robertson"],
+                writer("which_method").table("robertson"),
+            )
+        )
+        assert len(kept) == len(found) == 2
+        for (name, steps, error), (method, count, off) in zip(kept, found, strict=True):
+            assert method == name
+            assert int(count) == pytest.approx(int(steps), rel=0.05)
+            assert 0.1 < float(off) / float(error) < 10
+
+    def test_refusals_are_rows(self):
+        row = writer("which_method")._cells(Row("radau", reason="a | b"), "")
+        assert row.count("|") == len(re.findall(r"\|", writer("which_method").HEAD)) + 1
 
 
 @pytest.mark.slow
