@@ -71,17 +71,24 @@ def digest(figure: bytes) -> str:
     return hashlib.sha256(figure).hexdigest()
 
 
-def thumbnail(figure: bytes, /, **said: str) -> bytes:
+def thumbnail(figure: bytes, /, **words: str) -> bytes:
     """A figure, small, with what is said of it in it."""
     image = Image.open(io.BytesIO(figure)).convert("RGB")
     scale = SIZE / max(image.size)
     small = image.resize((round(scale * image.width), round(scale * image.height)), Image.Resampling.LANCZOS)
-    words, file = PngInfo(), io.BytesIO()
-    for key, value in said.items():
-        words.add_text(key, value)
+    info, file = PngInfo(), io.BytesIO()
+    for key, value in words.items():
+        info.add_text(key, value)
     coloured = small.quantize(128, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-    coloured.save(file, "PNG", pnginfo=words, optimize=True)
+    coloured.save(file, "PNG", pnginfo=info, optimize=True)
     return file.getvalue()
+
+
+def said(picture: Path | io.BytesIO) -> dict[Any, Any]:
+    """What is said in a picture of what it shows."""
+    with Image.open(picture) as image:
+        image.load()
+        return dict(image.info)
 
 
 def index() -> str:
@@ -122,11 +129,11 @@ def _scene_rows() -> Iterator[str]:
     for name, make in dae_jax.scenes.SCENES.items():
         function = getattr(make, "func", make)
         about = (inspect.getdoc(function) or "").split("\n\n")[0].replace("\n", " ").replace("|", r"\|").rstrip(":")
-        said = Image.open(HERE / "scenes" / f"{name}.png").text
+        shown = said(HERE / "scenes" / f"{name}.png")
         links = f"[`{function.__name__}`](reference/scenes.md#scenes{function.__name__})"
         yield (
             f"| ![{name}](gallery/scenes/{name}.png) | **{name}**, {links}, index {make().index}<br>{about}<br>"
-            f"By `{said['method']}`: error {said['error']} |"
+            f"By `{shown['method']}`: error {shown['error']} |"
         )
 
 

@@ -157,8 +157,7 @@ def _entry(name: str) -> Iterator[str]:
     value = _value(name)
     yield from ("```python", signature(name), "```", "", *_markdown(_words(name)))
     if hasattr(value, "_index_to_message"):
-        own = ast.parse(inspect.getsource(value)).body[0].body
-        members = [node.targets[0].id for node in own if isinstance(node, ast.Assign)]
+        members = [ast.unparse(node.targets[0]) for node in _tree(value).body if isinstance(node, ast.Assign)]
         yield from ("", *(f"- `{member}`: {value[getattr(value, member)]}" for member in members))
     elif isinstance(value, type):
         for member, of_class in _members(value).items():
@@ -230,7 +229,7 @@ def _written(value: Any) -> dict[str, tuple[str, str]]:
         if not base.__module__.startswith("dae_jax"):
             continue
         for node in _tree(base).body:
-            if isinstance(node, ast.AnnAssign):
+            if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
                 found[node.target.id] = (ast.unparse(node.annotation), _default(node.value))
             elif isinstance(node, ast.FunctionDef) and node.name == "__init__":
                 found |= _arguments(node)

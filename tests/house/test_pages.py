@@ -21,6 +21,8 @@ CODES = {name: messages(dae_jax.RESULTS)[int(code._value)] for name, code in dae
 @functools.cache
 def writer(folder):
     spec = importlib.util.spec_from_file_location(f"write_{folder}", NOTEBOOKS / folder / "write.py")
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
