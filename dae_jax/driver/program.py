@@ -18,7 +18,7 @@ from ..consistent import look_at_end, look_at_start
 from ..equations.regularity import COARSE
 from ..formulations import AbstractFormulation
 from ..solution import DAESolution
-from ..solvers import AbstractManifoldSolver, economical, takes_residuals
+from ..solvers import AbstractManifoldSolver, economical, replays, takes_residuals
 from ..types import Scalar, State
 from ..validate.user_functions import refuse_wrong_functions, returned
 from .diffrax_call import Decode, View, call
@@ -88,6 +88,8 @@ class Solve(eqx.Module):
     event: diffrax.Event | Reset | None
     max_steps: int | None = eqx.field(static=True)
     progress_meter: diffrax.AbstractProgressMeter
+    # Whether the dense output is there for the tape alone.
+    recording: bool = eqx.field(static=True, default=False)
 
     def __call__(self, problem: Problem) -> tuple[DAESolution, Any]:
         backwards = problem.t1 < problem.t0
@@ -162,10 +164,11 @@ class Solve(eqx.Module):
         def pull_back(inputs: tuple[Arrays], cotangent: Split) -> list[Any]:
             (arrays,) = inputs
             solve, problem = program.whole(arrays)
-            recording, also_arrays = dataclasses.replace(solve._forwards(), saveat=recorded(solve.saveat)).kernel(
-                problem
+            recording = dataclasses.replace(
+                solve._forwards(), saveat=recorded(solve.saveat, replays(solve.solver)), recording=True
             )
-            _, _, ts, ys, *_ = recording(also_arrays).numbers
+            record, also_arrays = recording.kernel(problem)
+            _, _, ts, ys, interpolation, *_ = record(also_arrays).numbers
             numbers, others = eqx.partition(arrays, eqx.is_inexact_array)
             fixed: list[Any] = []
 
@@ -177,7 +180,8 @@ class Solve(eqx.Module):
             found, through_encoding = jax.vjp(encoded, numbers)
             of_t0, of_t1, of_ts, of_ys, *_ = cotangent.numbers
             fixed_steps = isinstance(self.controller, diffrax.ConstantStepSize)
-            of_taped = cotangents(eqx.combine(found, Taped(*fixed)), fixed_steps, (ts["tape"], ys["tape"]), of_ys)
+            tape = ts["tape"], ys["tape"], None if interpolation is None else interpolation.path.infos
+            of_taped = cotangents(eqx.combine(found, Taped(*fixed)), fixed_steps, tape, of_ys)
             return inexact(through_encoding(saved_times(of_taped, self.saveat.subs, of_t0, of_t1, of_ts))[0])
 
         return pull_back
@@ -203,6 +207,5 @@ class Solve(eqx.Module):
 
     def between(self) -> bool:
         """Whether points between steps are asked for."""
-        return (
-            self.saveat.dense or any(part.ts is not None for part in saved_parts(self.saveat)) or self.event is not None
-        )
+        at_times = any(part.ts is not None for part in saved_parts(self.saveat))
+        return (self.saveat.dense and not self.recording) or at_times or self.event is not None

@@ -4,9 +4,11 @@ The derivative is that of the discrete solution (discretise-then-optimise), as w
 the sizes of the steps are constants, but for the last, which ends at t1. Forwards, the point of every accepted step is
 written down; backwards, each step is done once more together with its derivative. Both are loops of plain arithmetic,
 which compile to a kernel each; diffrax's checkpoints need library calls. It is used where the tape is small, and for
-solvers whose state is a function of the step's start.
+solvers whose step is a function of its start, or that can `replay` it: of implicit ones the tape has the stages, and a step
+costs its derivative alone.
 """
 
+import dataclasses
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import diffrax
@@ -16,7 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
-from ..solvers import is_recomputable
+from ..solvers import is_recomputable, replays
 from ..types import IntScalar, Scalar, Time, Y
 from .start import is_saved_part
 
@@ -39,14 +41,14 @@ def can_be_taped(solve: "Solve", size: int) -> bool:
         and type(solve.controller) in (diffrax.PIDController, diffrax.ConstantStepSize)
         and solve.max_steps is not None
         and (solve.max_steps + 1) * size <= LARGEST_TAPE
-        and is_recomputable(solve.solver)
+        and (is_recomputable(solve.solver) or replays(solve.solver))
     )
 
 
-def recorded(saveat: diffrax.SaveAt) -> Any:
-    """`saveat`, with every accepted step saved beside."""
+def recorded(saveat: diffrax.SaveAt, stages: bool) -> Any:
+    """`saveat`, with every accepted step saved beside, and its `stages`."""
     tape = diffrax.SubSaveAt(t0=True, steps=True, fn=as_it_is)
-    return eqx.tree_at(lambda s: s.subs, saveat, {"user": saveat.subs, "tape": tape}, is_leaf=is_saved_part)
+    return dataclasses.replace(saveat, subs={"user": saveat.subs, "tape": tape}, dense=stages)
 
 
 # What the tape holds: the point in the integration's variables.
@@ -66,16 +68,19 @@ class Taped(NamedTuple):
     view: Any
 
 
-def cotangents(taped: Taped, fixed_steps: bool, tape: tuple[Float[Array, " steps"], Y], wanted: PyTree[Array]) -> Taped:
+def cotangents(
+    taped: Taped, fixed_steps: bool, tape: tuple[Float[Array, " steps"], Y, PyTree[Array]], wanted: PyTree[Array]
+) -> Taped:
     """The cotangents of the inexact arrays in `taped`.
 
     **Arguments**
 
     - `fixed_steps`: whether the steps divide the interval evenly; otherwise all have sizes of their own but the last.
-    - `tape`: times and points of the accepted steps, the start first; times that are not finite are padding.
+    - `tape`: times and points of the accepted steps, the start first, and for a solver that replays them what is between;
+      times that are not finite are padding.
     - `wanted`: the cotangents of the saved values, a leading axis of times.
     """
-    times, points = tape
+    times, points, between = tape
     numbers, rest = eqx.partition(taped, eqx.is_inexact_array)
     part = taped.part
     save_times = jnp.zeros(0, times.dtype) if part.ts is None else part.ts
@@ -87,10 +92,13 @@ def cotangents(taped: Taped, fixed_steps: bool, tape: tuple[Float[Array, " steps
         all_of = eqx.combine(numbers, rest)
         return all_of.view(t, y, all_of.ode)
 
-    def step(numbers: PyTree, y: Y, a: Scalar, b: Scalar) -> Any:
+    def step(numbers: PyTree, y: Y, a: Scalar, b: Scalar, known: PyTree[Array]) -> Any:
         all_of = eqx.combine(numbers, rest)
         term, solver, ode = all_of.formulation.term(), all_of.solver, all_of.ode
-        y1, _, dense, *_ = solver.step(term, a, b, y, ode, solver.init(term, a, b, y, ode), False)
+        if replays(solver):
+            y1, dense = solver.replay(term, a, b, y, ode, known)
+        else:
+            y1, _, dense, *_ = solver.step(term, a, b, y, ode, solver.init(term, a, b, y, ode), False)
         return y1, dense if save_times.size else None
 
     def within(numbers: PyTree, dense: PyTree, a: Scalar, b: Scalar, t: Time) -> Any:
@@ -128,7 +136,10 @@ def cotangents(taped: Taped, fixed_steps: bool, tape: tuple[Float[Array, " steps
 
     def one_step(carry: tuple[PyTree, ...]) -> Any:
         k, j, of_y, of_numbers, of_t0, of_t1, of_times = carry
-        (_, dense), pull_back = jax.vjp(step, numbers, _entry(points, k), times[k], times[k + 1])
+        known = _entry(between, k)
+        (_, dense), pull_back = jax.vjp(
+            lambda *of: step(*of, known), numbers, _entry(points, k), times[k], times[k + 1]
+        )
         of_dense, of_a, of_b = _zeros(dense), jnp.zeros_like(of_t0), jnp.zeros_like(of_t0)
         if save_times.size:
             j, of_numbers, of_dense, of_a, of_b, of_times = saves_in_step(

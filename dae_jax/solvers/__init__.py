@@ -5,6 +5,7 @@ from .abilities import (
     economical as economical,
     is_explicit as is_explicit,
     is_recomputable as is_recomputable,
+    replays as replays,
     takes_residuals as takes_residuals,
 )
 from .bdf import BDF as BDF

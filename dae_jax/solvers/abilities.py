@@ -34,6 +34,11 @@ def is_recomputable(solver: diffrax.AbstractSolver) -> bool:
     return is_explicit(solver) or getattr(solver, "recomputable", False)
 
 
+def replays(solver: diffrax.AbstractSolver) -> bool:
+    """Whether a step can be done once more, for its derivative, from its start and its dense output."""
+    return hasattr(solver, "replay")
+
+
 def takes_residuals(solver: diffrax.AbstractSolver) -> TypeIs[AbstractResidualSolver]:
     """Whether a solver works on 0 = F(t, y, ẏ) in place of an ODE."""
     return isinstance(solver, AbstractResidualSolver)

@@ -61,7 +61,9 @@ class CollocationPolynomial(diffrax.AbstractLocalInterpolation):
             return self.evaluate(t1) - self.evaluate(t0)
         h = self.t1 - self.t0
         # After a jump in time diffrax asks for a point that is before the step by round-off.
-        return self.y0 + _along(self.z, jnp.clip((t0 - self.t0) / jnp.where(h == 0, 1, h), 0, 1))
+        part = jnp.clip((t0 - self.t0) / jnp.where(h == 0, 1, h), 0, 1)
+        # In a step that a jump may be in, the value is that after it.
+        return self.y0 + jnp.where(is_smallest(self.t0, self.t1), self.z[2], _along(self.z, part))
 
 
 def _along(z: Float[Array, "3 n"], s: Any) -> Float[Array, " n"]:
@@ -233,16 +235,7 @@ class RadauIIA5(AbstractResidualSolver):
         )
         step = _Step(args, time_sign(terms, t0, t1), t0, t1, y0)
         tol = tolerances(self.rtol, self.atol, y0.dtype)
-        # The unknowns of a stage are interleaved, so that a band stays one.
-        apart = lambda z: z.reshape(-1, 3).T
-        flat, (newton, jacobians, factors, pivot) = implicit_root(
-            lambda z, params: params[0].residuals(apart(z)).T.reshape(-1),
-            lambda params: _solve(*params),
-            (step, constant(state), tol),
-            linear_solve=_linear_solve,
-            jacobian=lambda z, params: _coupled(params[0], apart(z)),
-        )
-        z = apart(flat)
+        z, (newton, jacobians, factors, pivot) = _stages(lambda params: _solve(*params), (step, constant(state), tol))
         y1 = y0 + z[2]
         scaled = counted = _error(*constant((step, factors.real, z)), tol) * args.weights(step.h)
         if args.between(self.dense).any():
@@ -259,9 +252,31 @@ class RadauIIA5(AbstractResidualSolver):
         # What jumped says nothing of the next step.
         size = jnp.where(smallest, 0, step.h)
         new = _State(z, size, rates, jacobians, factors, size, slow, newton.eta)
-        # In a step that a jump may be in, the value is that after it.
-        dense = {"y0": jnp.where(smallest, y0 + z[2], y0), "z": jnp.where(smallest, 0, z)}
-        return y1, scaled, dense, constant(new), result
+        return y1, scaled, {"y0": y0, "z": z}, constant(new), result
+
+    def replay(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, dense: Any) -> Any:
+        step = _Step(args, time_sign(terms, t0, t1), t0, t1, y0)
+        z, _ = _stages(lambda params: (params[1], ()), (step, constant(dense["z"])))
+        return y0 + z[2], {"y0": y0, "z": z}
+
+
+def _stages(iterate: Callable[[Any], Any], params: Any) -> tuple[Float[Array, "3 n"], Any]:
+    """The stages zᵢ, and how they were found, with their derivative; `params` holds the `_Step` first."""
+    # The unknowns of a stage are interleaved, so that a band stays one.
+    apart, together = lambda z: z.reshape(-1, 3).T, lambda z: z.T.reshape(-1)
+
+    def found(params: Any) -> Any:
+        z, how = iterate(params)
+        return together(z), how
+
+    flat, how = implicit_root(
+        lambda z, params: together(params[0].residuals(apart(z))),
+        found,
+        params,
+        linear_solve=_linear_solve,
+        jacobian=lambda z, params: _coupled(params[0], apart(z)),
+    )
+    return apart(flat), how
 
 
 def _predicted(state: _State, h: Any) -> Float[Array, "3 n"]:
@@ -312,7 +327,7 @@ def _solve(step: _Step, state: _State, tol: Tolerances) -> Any:
     passes = passes_a_kink(newton, smallest, state.h != 0)
     z = jnp.where(passes & ~differential, 0, newton.x)
     found = newton._replace(x=None, converged=newton.converged | passes)
-    return z.T.reshape(-1), (found, jacobians, factors, pivot)
+    return z, (found, jacobians, factors, pivot)
 
 
 def _error(step: _Step, factor: Any, z: Any, tol: Tolerances) -> Float[Array, " n"]:
