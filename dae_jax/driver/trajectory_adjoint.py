@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
+from .._compat import WrapTerm
 from ..solvers import is_recomputable, replays
 from ..types import IntScalar, Scalar, Time, Y
 from .start import is_saved_part
@@ -85,25 +86,36 @@ def cotangents(
     part = taped.part
     save_times = jnp.zeros(0, times.dtype) if part.ts is None else part.ts
     first = int(part.t0)
-    direction = jnp.sign(taped.t1 - taped.t0)
+    direction = jnp.where(taped.t1 < taped.t0, -1, 1)
     last = jnp.sum(jnp.isfinite(times)) - 1
 
     def saved(numbers: PyTree, t: Time, y: Y) -> Any:
         all_of = eqx.combine(numbers, rest)
         return all_of.view(t, y, all_of.ode)
 
-    def step(numbers: PyTree, y: Y, a: Scalar, b: Scalar, known: PyTree[Array]) -> Any:
+    def parts(numbers: PyTree) -> tuple[Any, Any, Any]:
         all_of = eqx.combine(numbers, rest)
-        term, solver, ode = all_of.formulation.term(), all_of.solver, all_of.ode
+        return WrapTerm(all_of.formulation.term(), direction), all_of.solver, all_of.ode
+
+    def history_at_start(numbers: PyTree) -> Any:
+        term, solver, ode = parts(numbers)
+        if not replays(solver):
+            return ()
+        return solver.history_at_start(term, direction * times[0], direction * times[1], _entry(points, 0), ode)
+
+    def step(numbers: PyTree, y: Y, history: PyTree, a: Scalar, b: Scalar, known: PyTree[Array]) -> Any:
+        (term, solver, ode), a, b = parts(numbers), direction * a, direction * b
         if replays(solver):
-            y1, dense = solver.replay(term, a, b, y, ode, known)
+            y1, history, dense = solver.replay(term, a, b, y, ode, history, known)
         else:
             y1, _, dense, *_ = solver.step(term, a, b, y, ode, solver.init(term, a, b, y, ode), False)
-        return y1, dense if save_times.size else None
+        moving, fixed = eqx.partition(dense if save_times.size else None, eqx.is_inexact_array)
+        return (y1, history, moving), fixed
 
-    def within(numbers: PyTree, dense: PyTree, a: Scalar, b: Scalar, t: Time) -> Any:
+    def within(numbers: PyTree, moving: PyTree, fixed: PyTree, a: Scalar, b: Scalar, t: Time) -> Any:
         solver = eqx.combine(numbers, rest).solver
-        return saved(numbers, t, solver.interpolation_cls(t0=a, t1=b, **dense).evaluate(t))
+        path = solver.interpolation_cls(t0=direction * a, t1=direction * b, **eqx.combine(moving, fixed))
+        return saved(numbers, t, path.evaluate(direction * t))
 
     def shared(k: IntScalar, cotangent: Scalar) -> tuple[Any, Any]:
         """The cotangent of the k-th time as those of t0 and t1: how diffrax's controllers make it from them."""
@@ -111,7 +123,7 @@ def cotangents(
         fraction = jnp.where(times[k] == taped.t1, 1.0, evenly)
         return (1 - fraction) * cotangent, fraction * cotangent
 
-    def saves_in_step(k: IntScalar, dense: PyTree, carry: tuple[PyTree, ...]) -> Any:
+    def saves_in_step(k: IntScalar, moving: PyTree, fixed: PyTree, carry: tuple[PyTree, ...]) -> Any:
         a, b = times[k], times[k + 1]
 
         def more(carry: tuple[PyTree, ...]) -> Any:
@@ -120,7 +132,9 @@ def cotangents(
 
         def pull(carry: tuple[PyTree, ...]) -> Any:
             j, of_numbers, of_dense, of_a, of_b, of_times = carry
-            _, pull_back = jax.vjp(within, numbers, dense, a, b, save_times[j])
+            _, pull_back = jax.vjp(
+                lambda n, moving, a, b, t: within(n, moving, fixed, a, b, t), numbers, moving, a, b, save_times[j]
+            )
             more_numbers, more_dense, more_a, more_b, of_t = pull_back(_entry(wanted, first + j))
             of_times = lax.dynamic_update_index_in_dim(of_times, of_times[j] + of_t, j, 0)
             return (
@@ -134,28 +148,38 @@ def cotangents(
 
         return lax.while_loop(more, pull, carry)
 
+    begin, begins = jax.vjp(history_at_start, numbers)
+
     def one_step(carry: tuple[PyTree, ...]) -> Any:
-        k, j, of_y, of_numbers, of_t0, of_t1, of_times = carry
+        k, j, of_y, of_history, of_numbers, of_t0, of_t1, of_times = carry
+        history = begin
+        if jax.tree.leaves(begin):
+            before = taped.solver.history_after(_entry(between, jnp.maximum(k - 1, 0)))
+            history = jax.tree.map(lambda x, y: jnp.where(k == 0, x, y), begin, before)
         known = _entry(between, k)
-        (_, dense), pull_back = jax.vjp(
-            lambda *of: step(*of, known), numbers, _entry(points, k), times[k], times[k + 1]
+        (_, _, moving), pull_back, fixed = jax.vjp(
+            lambda *of: step(*of, known), numbers, _entry(points, k), history, times[k], times[k + 1], has_aux=True
         )
-        of_dense, of_a, of_b = _zeros(dense), jnp.zeros_like(of_t0), jnp.zeros_like(of_t0)
+        of_dense, of_a, of_b = _zeros(moving), jnp.zeros_like(of_t0), jnp.zeros_like(of_t0)
         if save_times.size:
             j, of_numbers, of_dense, of_a, of_b, of_times = saves_in_step(
-                k, dense, (j, of_numbers, of_dense, of_a, of_b, of_times)
+                k, moving, fixed, (j, of_numbers, of_dense, of_a, of_b, of_times)
             )
-        more_numbers, of_y, more_a, more_b = pull_back((of_y, of_dense))
+        more_numbers, of_y, of_history, more_a, more_b = pull_back((of_y, of_history, of_dense))
         (a0, a1), (b0, b1) = shared(k, of_a + more_a), shared(k + 1, of_b + more_b)
-        return k - 1, j, of_y, _sum(of_numbers, more_numbers), of_t0 + a0 + b0, of_t1 + a1 + b1, of_times
+        of_numbers = _sum(of_numbers, more_numbers)
+        return k - 1, j, of_y, of_history, of_numbers, of_t0 + a0 + b0, of_t1 + a1 + b1, of_times
 
     of_y, of_numbers, zero = _zeros(_entry(points, 0)), _zeros(numbers), jnp.zeros_like(taped.t0)
     of_t1 = zero
     if part.t1:
         _, pull_back = jax.vjp(saved, numbers, taped.t1, _entry(points, last))
         of_numbers, of_t1, of_y = pull_back(_entry(wanted, -1))
-    carry = (last - 1, save_times.size - 1, of_y, of_numbers, zero, of_t1, jnp.zeros_like(save_times))
-    *_, of_y, of_numbers, of_t0, of_t1, of_times = lax.while_loop(lambda carry: carry[0] >= 0, one_step, carry)
+    carry = (last - 1, save_times.size - 1, of_y, _zeros(begin), of_numbers, zero, of_t1, jnp.zeros_like(save_times))
+    _, _, of_y, of_begin, of_numbers, of_t0, of_t1, of_times = lax.while_loop(
+        lambda carry: carry[0] >= 0, one_step, carry
+    )
+    of_numbers = _sum(of_numbers, begins(of_begin)[0])
     if part.t0:
         _, pull_back = jax.vjp(saved, numbers, taped.t0, taped.y)
         more_numbers, more_t0, more_y = pull_back(_entry(wanted, 0))

@@ -8,6 +8,7 @@ from typing_extensions import TypeIs
 
 from .explicit import unrolled
 from .manifold import AbstractManifoldSolver
+from .replay import Replayable
 from .residual_steps import AbstractResidualSolver
 
 
@@ -35,8 +36,9 @@ def is_recomputable(solver: diffrax.AbstractSolver) -> bool:
 
 
 def replays(solver: diffrax.AbstractSolver) -> bool:
-    """Whether a step can be done once more, for its derivative, from its start and its dense output."""
-    return hasattr(solver, "replay")
+    """Whether a step can be done once more, for its derivative, from its dense output."""
+    inner = getattr(solver, "solver", None)
+    return isinstance(solver, Replayable) and (inner is None or is_explicit(inner) or replays(inner))
 
 
 def takes_residuals(solver: diffrax.AbstractSolver) -> TypeIs[AbstractResidualSolver]:

@@ -1,6 +1,7 @@
 """Backward differentiation formulas of order 1 to 5 with variable steps for 0 = F(t, y, ẏ)."""
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
@@ -11,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..linalg import implicit_root, rms_norm
 from .manifold import time_sign
+from .replay import Replayable
 from .residual_steps import (
     AbstractResidualSolver,
     Iteration,
@@ -42,24 +44,31 @@ SAFETY, ERROR_ORDER = 0.9, 2
 
 
 class NewtonPolynomial(diffrax.AbstractLocalInterpolation):
-    """Σ φⱼ Πᵢ (t − tₙ₋ᵢ)/ψᵢ₊₁, i < j: the polynomial through the last points that the step's formula has used."""
+    """Σ φⱼ Πᵢ (t − tₙ₋ᵢ)/ψᵢ₊₁, i < j ≤ k: the polynomial through the last points that the step's formula of this `order` has
+    used; the value at the end where algebraic variables have `jumped` in the step. `first`: without a history.
+    """
 
     t0: Any
     t1: Any
     phi: Any
     psi: Any
+    order: Any
+    jumped: Any
+    first: Any
 
     def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Any:
         """The value at `t0`, or the increment from there to `t1`."""
         if t1 is not None:
             return self.evaluate(t1) - self.evaluate(t0)
         psi = jnp.where(self.psi == 0, 1, self.psi)
+        used = jnp.where(self.jumped > 0, 0, self.order)
+        phi = [jnp.where(j <= used, self.phi[j], 0) for j in ROWS]
         # After a jump in time diffrax asks for a point that is before the step by round-off.
         inside = jnp.clip(t0, self.t0, self.t1)
-        y = self.phi[MAX_ORDER]
+        y = phi[MAX_ORDER]
         for j in reversed(range(MAX_ORDER)):
             distance = inside - self.t1 + (self.psi[j - 1] if j else 0)
-            y = self.phi[j] + distance / psi[j] * y
+            y = phi[j] + distance / psi[j] * y
         return y
 
 
@@ -116,7 +125,7 @@ class _Step(NamedTuple):
         return _Factors(factors, tol.round_off(self.linearised, j, m, self.c, self.y)), pivot
 
 
-class BDF(AbstractResidualSolver):
+class BDF(Replayable, AbstractResidualSolver):
     """The backward differentiation formulas of order 1 to 5 for 0 = F(t, y, ẏ), of variable step and order.
 
     The polynomial y* of degree k through the last k + 1 points predicts y and ẏ at t₁; the solution's polynomial goes
@@ -177,24 +186,12 @@ class BDF(AbstractResidualSolver):
                 made_jump, lambda: _start(sign * constant(args.rates(sign * t0, y0)), state.factors), lambda: state
             )
         tol = tolerances(self.rtol, self.atol, y0.dtype)
-        k, method = state.order, _formula(state, h)
-        star = [y0] + [b * row for b, row in zip(method.beta[1:], state.phi, strict=True)]
-        y = sum(jnp.where(j <= k, row, 0) for j, row in enumerate(star))
-        rate = sum(jnp.where(j <= k, g * row, 0) for j, (g, row) in enumerate(zip(method.gamma, star, strict=True)))
-        y1, (newton, passes, factors, pivot) = implicit_root(
-            lambda y, params: params[0].residual(y),
-            lambda params: _solve(*params),
-            (_Step(args, sign, t1, h, method.c, y, rate), *constant((y0, state, is_smallest(t0, t1))), tol),
-            linear_solve=lambda inverse, b: inverse(b),
-            jacobian=lambda y, params: functools.partial(
-                params[0].linearised.solve, params[0].factor(y, params[-1])[0].matrix
-            ),
+        k, method = state.order, _formula(state.order, state.steps == 0, state.psi, h)
+        step, star = _predicted(method, k, state.phi, args, sign, t1, h, y0)
+        y1, (newton, passes, factors, pivot) = _point(
+            lambda params: _solve(*params), (step, *constant((y0, state, is_smallest(t0, t1))), tol)
         )
-        # Row j of the new differences is the change and all rows from j to k; rows above k are not used yet, or are φₖ₊₁.
-        phi = [y1 - y]
-        for j in reversed(ROWS):
-            phi.append(jnp.where(j <= k, phi[-1] + star[j], phi[-1]))
-        change, *phi = [phi[0], *reversed(phi[1:])]
+        change, phi = _differences(y1 - step.y, star, k)
 
         scale = args.weights(h) * args.counted(self.dense) / tol.scale(y0, y1)
         size = lambda row: rms_norm(constant(row * scale))
@@ -217,9 +214,60 @@ class BDF(AbstractResidualSolver):
             *constant((factors, method.c, newton.eta)),
         )  # fmt: skip
         new = jax.tree.map(lambda a, b: jnp.where(jumped, a, b), _start(jnp.zeros_like(y1), new.factors), new)
-        # In a step that a jump is in, the value is that after it.
-        used = jnp.stack([jnp.where(j <= jnp.where(jumped, 0, k), 1, 0) for j in ROWS])[:, None]
-        return y1, error, {"phi": jnp.where(used, phi, 0), "psi": method.psi}, new, result
+        # Numbers, all of them: diffrax fills what is not reached with infinity.
+        marks = (x.astype(y0.dtype) for x in (k, jumped, state.steps == 0))
+        dense = {"phi": phi, "psi": method.psi, **dict(zip(("order", "jumped", "first"), marks, strict=True))}
+        return y1, error, dense, new, result
+
+    def history_at_start(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Any:
+        start = _start(time_sign(terms, t0, t1) * args.start, None)
+        return start.phi, start.psi
+
+    def history_after(self, dense: Any) -> Any:
+        return jnp.where(dense["jumped"] > 0, 0, dense["phi"][1:]), dense["psi"]
+
+    def replay(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, history: Any, dense: Any) -> Any:
+        h, sign, k = jnp.where(t1 == t0, 1, t1 - t0), time_sign(terms, t0, t1), dense["order"].astype(int)
+        phi, psi = history
+        method = _formula(k, dense["first"] > 0, psi, h)
+        step, star = _predicted(method, k, phi, args, sign, t1, h, y0)
+        found = constant(dense["phi"][0]), tolerances(self.rtol, self.atol, y0.dtype)
+        y1, _ = _point(lambda params: (params[1], ()), (step, *found))
+        dense = {**dense, "phi": jnp.stack(_differences(y1 - step.y, star, k)[1]), "psi": method.psi}
+        return y1, self.history_after(dense), dense
+
+
+def _predicted(
+    method: "_Formula", k: Any, phi: Any, args: Any, sign: Any, t1: Any, h: Any, y0: Any
+) -> tuple[_Step, list[Any]]:
+    """The equation of a step of order k, and the differences that predict it."""
+    star = [y0] + [b * row for b, row in zip(method.beta[1:], phi, strict=True)]
+    y = sum(jnp.where(j <= k, row, 0) for j, row in enumerate(star))
+    rate = sum(jnp.where(j <= k, g * row, 0) for j, (g, row) in enumerate(zip(method.gamma, star, strict=True)))
+    return _Step(args, sign, t1, h, method.c, y, rate), star
+
+
+def _point(iterate: Callable[[Any], Any], params: Any) -> tuple[Float[Array, " n"], Any]:
+    """y at t₁, and how it was found, with its derivative; `params` holds the `_Step` first and the tolerances last."""
+    return implicit_root(
+        lambda y, params: params[0].residual(y),
+        iterate,
+        params,
+        linear_solve=lambda inverse, b: inverse(b),
+        jacobian=lambda y, params: functools.partial(
+            params[0].linearised.solve, params[0].factor(y, params[-1])[0].matrix
+        ),
+    )
+
+
+def _differences(change: Any, star: list[Any], k: Any) -> tuple[Any, list[Any]]:
+    """The change and the new differences: row j is the change and all rows from j to k; rows above k are not used yet, or
+    are φₖ₊₁.
+    """
+    phi = [change]
+    for j in reversed(ROWS):
+        phi.append(jnp.where(j <= k, phi[-1] + star[j], phi[-1]))
+    return change, phi[:0:-1]
 
 
 def _start(rates: Float[Array, " n"], factors: Any) -> _State:
@@ -256,9 +304,8 @@ class _Formula(NamedTuple):
     constant: Any
 
 
-def _formula(state: _State, h: Any) -> _Formula:
-    k, first = state.order, state.steps == 0
-    old = [jnp.where(first, (j + 1) * h, state.psi[j]) for j in ROWS]
+def _formula(k: Any, first: Any, psi: Any, h: Any) -> _Formula:
+    old = [jnp.where(first, (j + 1) * h, psi[j]) for j in ROWS]
     new = [h] + [x + h for x in old[:-1]]
     alpha = [h / x for x in new]
     beta, gamma, sigma = [jnp.ones_like(h)], [jnp.zeros_like(h)], [jnp.ones_like(h)]

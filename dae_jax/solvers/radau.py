@@ -25,6 +25,7 @@ from .radau_coefficients import (
     POLYNOMIAL,
     TRANSFORM,
 )
+from .replay import Replayable
 from .residual_steps import (
     AbstractResidualSolver,
     Iteration,
@@ -172,7 +173,7 @@ class _Step(NamedTuple):
         return -jnp.stack([jnp.where(self.smallest, w, stage) for stage in stages])
 
 
-class RadauIIA5(AbstractResidualSolver):
+class RadauIIA5(Replayable, AbstractResidualSolver):
     """The Radau IIA method with three stages: order 5, stiffly accurate, L-stable, for 0 = F(t, y, ẏ) of index 0 to 3.
 
         0 = F(t₀ + cᵢ h, Yᵢ, Kᵢ),   Yᵢ = y₀ + h Σ aᵢⱼ Kⱼ,   y₁ = Y₃.
@@ -254,10 +255,10 @@ class RadauIIA5(AbstractResidualSolver):
         new = _State(z, size, rates, jacobians, factors, size, slow, newton.eta)
         return y1, scaled, {"y0": y0, "z": z}, constant(new), result
 
-    def replay(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, dense: Any) -> Any:
+    def replay(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, history: Any, dense: Any) -> Any:
         step = _Step(args, time_sign(terms, t0, t1), t0, t1, y0)
         z, _ = _stages(lambda params: (params[1], ()), (step, constant(dense["z"])))
-        return y0 + z[2], {"y0": y0, "z": z}
+        return y0 + z[2], history, {"y0": y0, "z": z}
 
 
 def _stages(iterate: Callable[[Any], Any], params: Any) -> tuple[Float[Array, "3 n"], Any]:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from .chart_steps import AbstractChartSolver
 from .manifold import time_sign
+from .replay import Replayable
 from .residual_steps import AbstractResidualSolver, constant
 
 
@@ -22,7 +23,7 @@ class Selection(NamedTuple):
     switches: Any
 
 
-class SelectedStates(AbstractChartSolver):
+class SelectedStates(Replayable, AbstractChartSolver):
     """A step of an explicit solver in some entries of the state, its *states*; the others, as many as there are
     constraints, are found from H(t, y) = 0 by Newton's method at each stage. Used by `DummyDerivatives`, which see.
     """
@@ -41,8 +42,13 @@ class SelectedStates(AbstractChartSolver):
         )
         return y1, error, dense, Selection(derivative, directions, solver_state.switches + switched), result
 
+    def replay(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, history: Any, dense: Any) -> Any:
+        derivative = terms.vf(t0, y0, args)
+        y1, _, dense, *_ = self.step_in(dense["normals"], terms, t0, t1, y0, args, derivative, False)
+        return y1, history, dense
 
-class SelectedResiduals(AbstractResidualSolver):
+
+class SelectedResiduals(Replayable, AbstractResidualSolver):
     """A step of a solver of residuals on an `Index1Form`, in which the entries that are not integrated are algebraic
     variables. The unknowns are the same whatever is selected, so that a multistep method keeps its history. Used by
     `DummyDerivatives`, which see.
@@ -56,7 +62,7 @@ class SelectedResiduals(AbstractResidualSolver):
 
     @property
     def interpolation_cls(self) -> Any:
-        return self.solver.interpolation_cls
+        return lambda t0, t1, inner, directions: self.solver.interpolation_cls(t0=t0, t1=t1, **inner)
 
     def order(self, terms: Any) -> Any:
         return self.solver.order(terms)
@@ -76,9 +82,27 @@ class SelectedResiduals(AbstractResidualSolver):
             time_sign(terms, t0, t1) * t0, y0[: ode.orders.size], solver_state.directions
         )
         solver = dataclasses.replace(self.solver, rtol=self.rtol, atol=self.atol)
-        linearised = eqx.tree_at(lambda p: p.form.directions, args, directions)
         state = jax.tree.map(
             lambda a, b: jnp.where(switched, a, b), self.invalidate_jacobian(solver_state), solver_state
         )
-        *step, inner, result = solver.step(terms, t0, t1, y0, linearised, state.inner, made_jump)
-        return *step, Selection(inner, directions, solver_state.switches + switched), result
+        y1, error, dense, inner, result = solver.step(
+            terms, t0, t1, y0, _selected(args, directions), state.inner, made_jump
+        )
+        dense = {"inner": dense, "directions": directions}
+        return y1, error, dense, Selection(inner, directions, solver_state.switches + switched), result
+
+    def history_at_start(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Any:
+        return self.solver.history_at_start(terms, t0, t1, y0, args)
+
+    def history_after(self, dense: Any) -> Any:
+        return self.solver.history_after(dense["inner"])
+
+    def replay(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, history: Any, dense: Any) -> Any:
+        linearised = _selected(args, dense["directions"])
+        y1, history, inner = self.solver.replay(terms, t0, t1, y0, linearised, history, dense["inner"])
+        return y1, history, {**dense, "inner": inner}
+
+
+def _selected(args: Any, directions: Any) -> Any:
+    """The linearised `Index1Form` with these entries as algebraic variables."""
+    return eqx.tree_at(lambda p: p.form.directions, args, directions)
