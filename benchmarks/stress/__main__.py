@@ -1,0 +1,85 @@
+"""What each method can take: `python -m benchmarks.stress` or `dae-jax stress`."""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+from dae_jax.app import options
+
+from . import page
+from .cases import METHODS
+from .families import FAMILIES, SCENE, cases_of
+from .runner import LIMIT, run
+
+
+# A part of the methods and of each family that shows within two minutes whether all is in order.
+QUICK_METHODS = ("projection-dop853", "baumgarte", "radau-ggl", "rattle")
+QUICK_FAMILIES = ("scales", "broken")
+
+
+def main(argv=None):
+    """Solve, print a line a cell, and write table, page and figures."""
+    parser = argparse.ArgumentParser(prog="dae-jax stress", description=__doc__)
+    parser.add_argument(
+        "scenes", nargs="*", metavar="SCENE",
+        help="mechanisms of the library, for stressors that fit all; by default the families with systems of their own",
+    )  # fmt: skip
+    parser.add_argument("--methods", help=f"names, separated by commas; by default all: {', '.join(METHODS)}")
+    parser.add_argument("--stressors", help=f"families, separated by commas; by default all: {', '.join(FAMILIES)}")
+    parser.add_argument(
+        "--quick", action="store_true", help="a smoke test: few methods and stressors, under two minutes"
+    )
+    parser.add_argument("--limit", type=float, default=LIMIT, help=f"seconds for a cell; by default {LIMIT}")
+    parser.add_argument("--out", type=Path, default=Path("stress"), help="folder for table, page and figures")
+    arguments = parser.parse_args(argv)
+    options.refuse_not_positive(parser, **{"--limit": arguments.limit})
+    if arguments.scenes and arguments.stressors:
+        parser.error("--stressors is not for scenes: they have stressors that fit all")
+    for scene in arguments.scenes:
+        options.mechanism(parser, scene)
+    methods = _names(parser, "method", arguments.methods, METHODS, QUICK_METHODS if arguments.quick else METHODS)
+    families = _names(parser, "family", arguments.stressors, FAMILIES, QUICK_FAMILIES if arguments.quick else FAMILIES)
+    families = [SCENE + scene for scene in arguments.scenes] or families
+    options.writable(parser, arguments.out)
+    cells, grown, begin = [], {}, time.perf_counter()
+    try:
+        for family in families:
+            cases = cases_of(family, arguments.quick)
+            todo = [(case.name, name) for name in methods for case in cases if case.applies(name)]
+            for cell, series in run(family, todo, arguments.quick, arguments.limit):
+                print(_line(cell), flush=True)
+                cells.append(cell)
+                if series:
+                    grown[cell.stressor, cell.method] = series
+            if hasattr(FAMILIES.get(family), "figures"):
+                FAMILIES[family].figures(arguments.out, arguments.quick, cells)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"{len(cells)} cells are done and kept in {arguments.out}") from None
+    finally:
+        if cells:
+            written = page.write(cells, grown, arguments.out, time.perf_counter() - begin)
+    print(page.counts(cells), *written, sep="\n")
+    return int(any(cell.verdict == "WRONG" for cell in cells))
+
+
+def _names(parser, kind, given, known, default):
+    names = list(default) if given is None else [name.strip() for name in given.split(",")]
+    for name in names:
+        if name not in known:
+            parser.error(f"unknown {kind} {name!r}; choose from {', '.join(known)}")
+    return names
+
+
+def _line(cell):
+    lost = f" by {cell.lost:.1f} digits" if cell.verdict == "degraded" else ""
+    said = (
+        cell.words
+        if cell.ended != "answer"
+        else f"error {cell.error:.1e} of {cell.allowed:.0e} allowed, drift {cell.drift:.0e}"
+    )
+    return f"{cell.family:10s} {cell.stressor:28s} {cell.method:20s} {cell.verdict}{lost}: {said[:110]}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
