@@ -42,7 +42,7 @@ def main(argv=None):
     families = _names(parser, "family", arguments.stressors, FAMILIES, QUICK_FAMILIES if arguments.quick else FAMILIES)
     families = [SCENE + scene for scene in arguments.scenes] or families
     options.writable(parser, arguments.out)
-    cells, grown, begin = [], {}, time.perf_counter()
+    cells, grown, drawn, begin = [], {}, [], time.perf_counter()
     try:
         for family in families:
             cases = cases_of(family, arguments.quick)
@@ -53,12 +53,12 @@ def main(argv=None):
                 if series:
                     grown[cell.stressor, cell.method] = series
             if hasattr(FAMILIES.get(family), "figures"):
-                FAMILIES[family].figures(arguments.out, arguments.quick, cells)
+                drawn += FAMILIES[family].figures(arguments.out, arguments.quick, cells)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"{len(cells)} cells are done and kept in {arguments.out}") from None
     finally:
         if cells:
-            written = page.write(cells, grown, arguments.out, time.perf_counter() - begin)
+            written = page.write(cells, grown, drawn, arguments.out, time.perf_counter() - begin)
     print(page.counts(cells), *written, sep="\n")
     return int(any(cell.verdict == "WRONG" for cell in cells))
 

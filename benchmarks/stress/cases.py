@@ -55,15 +55,17 @@ class Case:
     """One stressor.
 
     - `name`; `system`, `y0`, `args`; `t1` in s.
-    - `truth(times)`: (q, v) at these times, not from this library.
+    - `truth(times)`: (q, v) at these times, not from this library; `or_else(times)`: where the equations have two solutions.
     - `size`: of positions and of velocities, numbers or arrays like q: errors and drift are relative to it.
     - `rtol`; the absolute tolerance is `rtol` times the smallest size, at most 1.
     - `steps`, `rate`: of methods with fixed steps, how many, and the angular frequency that they must resolve, in 1/s.
     - `chart`: for the state-space form.
-    - `due`: what must happen: an "answer", a "refusal", a "failure" (at the time `ends`), or "either", an answer or words.
+    - `due`: what must happen: an "answer", a "refusal", a "failure" (at the time `ends`), "words" (either of them, at any time)
+      or "any" of all that, an answer only if it is right.
     - `times`: how many to compare at; `energy(q, v)`: where its growth and that of errors are recorded.
-    - `only`: the methods that it is for; by default all.
-    - `off`: by how much the start is off, as a part of the sizes.
+    - `only`: the methods that it is for; by default all. `fixed`: fixed steps for all of them.
+    - `off`: by how much the start is off, as a part of the sizes. `bound`: the error that is allowed, in place of the rule.
+    - `formulation`: in place of the method's. `lasting`: so long that a tolerance, which is for a step, says little of the end.
     """
 
     name: str
@@ -82,8 +84,13 @@ class Case:
     times: int = 21
     energy: Callable[..., Any] | None = None
     only: tuple[str, ...] = ()
+    or_else: Callable[[np.ndarray], Any] | None = None
+    fixed: bool = False
     off: float = 0.0
-    max_steps: int = 200_000
+    bound: float | None = None
+    formulation: Any = None
+    max_steps: int = 100_000
+    lasting: bool = False
 
     def applies(self, name: str) -> bool:
         """Whether the method of this name is for it."""
@@ -92,7 +99,10 @@ class Case:
 
     def allowed(self, method: Method) -> float:
         """The error of an `ok` cell: a thousand tolerances; of fixed steps ten times what their order says, (ω h)^p a radian."""
+        if self.bound is not None:
+            return self.bound
         if method.order is None:
             return min(1e3 * self.rtol, 0.1) + 10 * self.off
         phase = self.rate * abs(self.t1)
-        return float(np.clip(10 * (1 + phase) * (phase / self.steps) ** method.order, 1e-10, 0.1)) + 10 * self.off
+        rounding = 1e4 * float(np.finfo(self.y0[0].dtype).eps)
+        return float(np.clip(10 * (1 + phase) * (phase / self.steps) ** method.order, rounding, 0.1)) + 10 * self.off

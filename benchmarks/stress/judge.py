@@ -8,10 +8,11 @@ from .cases import METHODS, Case
 from .solve import Outcome
 
 
-# An answer with fewer than two digits, where more were asked for, is wrong without a word.
+# An answer with fewer than two digits, where more were asked for, is wrong without a word; over long times one as large as the motion.
 WRONG = 1e-2
 # A failure is at the right time within this part of the interval.
 AT_THE_TIME = 2e-3
+BOTH = ("refused", "failed")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,12 +41,13 @@ def judged(family: str, case: Case, method: str, outcome: Outcome) -> Cell:
     allowed = case.allowed(METHODS[method])
     lost = float(max(np.log10(outcome.error / allowed), 0.0)) if outcome.error > 0 else 0.0
     if outcome.ended == "answer":
-        bad = case.due in ("failure", "refusal") or not outcome.error <= max(WRONG, 10 * allowed)
+        least = 1.0 if case.lasting else max(WRONG, 10 * allowed)
+        bad = case.due in ("failure", "refusal", "words") or not outcome.error <= least
         verdict = "WRONG" if bad else "degraded" if lost > 0 else "ok"
     else:
         late = case.due == "failure" and outcome.end > case.ends + AT_THE_TIME * case.t1
         early = case.due == "failure" and outcome.end < case.ends - AT_THE_TIME * case.t1
-        wanted = {"failure": ("failed", "refused"), "refusal": ("refused",), "either": ("refused", "failed")}
+        wanted = {"failure": BOTH, "refusal": ("refused",), "words": BOTH, "any": BOTH}
         due = outcome.ended in wanted.get(case.due, ()) and not early
         verdict = "WRONG" if late else "ok" if due else outcome.ended
     kept = {name: getattr(outcome, name) for name in ("ended", "error", "drift", "end", "steps", "seconds", "words")}

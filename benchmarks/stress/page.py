@@ -32,7 +32,7 @@ scipy at 1e-13. Errors are relative to the size of the motion, and drift is |g| 
 """
 
 
-def write(cells, grown, folder, seconds):
+def write(cells, grown, drawn, folder, seconds):
     """The paths of what was written."""
     paths = [folder / "stress.csv", folder / "stress.md", folder / "stress.png"]
     with paths[0].open("w", newline="") as file:
@@ -47,8 +47,6 @@ def write(cells, grown, folder, seconds):
     ]
     for family in dict.fromkeys(cell.family for cell in cells):
         text.append(_family(family, [cell for cell in cells if cell.family == family]))
-    figures = sorted(path.name for path in folder.glob("stress-*.png"))
-    text += [f"![{name.removesuffix('.png').replace('-', ' ')}]({name})\n" for name in figures]
     paths[1].write_text("\n".join(filter(None, text)))
     figure.table(cells).savefig(paths[2])
     return paths

@@ -51,7 +51,9 @@ def _silent(family: str, stressor: str, method: str, words: str) -> Cell:
 def _worker(family: str, quick: bool):
     """A process that takes cells and gives lines, "" at its end."""
     command = [sys.executable, "-m", "benchmarks.stress.worker", family, *["--quick"] * quick]
-    with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
         lines: queue.Queue[str] = queue.Queue()
 
         def read():
@@ -70,3 +72,5 @@ def _worker(family: str, quick: bool):
         finally:
             process.kill()
             reader.join()
+            with contextlib.suppress(BrokenPipeError):
+                process.stdin.close()

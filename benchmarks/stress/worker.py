@@ -26,11 +26,12 @@ def main():
     from .judge import judged
     from .solve import solved
 
-    cases = {case.name: case for case in cases_of(arguments.family, arguments.quick)}
+    cases = cases_of(arguments.family, arguments.quick)
     for line in sys.stdin:
         stressor, method = json.loads(line)
-        outcome = solved(cases[stressor], method)
-        cell = dataclasses.asdict(judged(arguments.family, cases[stressor], method, outcome))
+        case = next(case for case in cases if case.name == stressor and case.applies(method))
+        outcome = solved(case, method)
+        cell = dataclasses.asdict(judged(arguments.family, case, method, outcome))
         cell["series"] = {name: np.asarray(x).tolist() for name, x in outcome.series.items()}
         print(json.dumps(cell), file=out, flush=True)
 

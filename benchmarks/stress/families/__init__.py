@@ -1,10 +1,19 @@
-"""The stressors by family: {name: module}; each module has `cases(quick)` and says in its docstring what it is about."""
+"""The stressors by family: {name: module}; each module has `cases(quick)` and says in its docstring what it is about; one
+with `figures(folder, quick, cells)` draws, and gives the names and what they show.
+"""
 
-from . import any_scene, broken, scales
+from . import any_scene, baumgarte, broken, extremes, horizons, loops, precision, scales, singular, steps
 
 
 FAMILIES = {
+    "horizons": horizons,
+    "steps": steps,
+    "baumgarte": baumgarte,
     "scales": scales,
+    "singular": singular,
+    "loops": loops,
+    "extremes": extremes,
+    "precision": precision,
     "broken": broken,
 }
 # Before the name of a scene, in place of a family's.

@@ -29,7 +29,7 @@ def cases(quick):
     ]
     for power in (14, 2) if quick else (14, 12, 10, 8, 6, 4, 2):
         off = 10.0**-power
-        due = "answer" if power >= 10 else "refusal" if power <= 6 else "either"
+        due = "answer" if power >= 10 else "refusal" if power <= 6 else "any"
         # The start is outside of the circle, and moves outwards.
         found.append(case(f"start off by 1e-{power}", y0=(q * (1 + off), v + off * q), due=due, off=off))
     return found

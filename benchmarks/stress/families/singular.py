@@ -1,0 +1,143 @@
+"""Configurations at and near a singularity of the constraints.
+
+A slider-crank whose rod is longer than its crank by δ, in θ and s, 0 = s² − 2 s sin θ − η with η = 2δ + δ²: at θ = 0 the slider turns
+within √η rad. At δ = 0 two motions cross there, the smooth one and the limit of small δ: each is a solution, and words are as good. A
+parallelogram passes its change point; two rods are pulled apart
+until they are straight, after which there is no state: a failure at that time is due.
+"""
+
+import itertools
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.integrate import quad
+from scipy.optimize import brentq
+
+import dae_jax as dj
+
+from ..cases import Case
+from . import pendulum
+
+
+def no_force(t, q, v, args):
+    """Inertia alone."""
+    return 0 * v
+
+
+def closing(t, q, args):
+    """(|slider − pin|² − ℓ²)/2."""
+    return (q[1] ** 2 - 2 * q[1] * jnp.sin(q[0]) - args["eta"]) / 2
+
+
+def chart(t, z, args):
+    """The sheet with s > 0."""
+    sine = jnp.sin(z[0])
+    return jnp.stack([z[0], sine + jnp.sqrt(sine**2 + args["eta"])])
+
+
+SLIDER = dj.ConstrainedSystem(no_force, closing)
+
+
+def dead_centre(excess, angle=0.8, rate=-2.0):
+    """Passes θ = 0 with the slider turning within √(2δ) rad. With sin θ = √η sinh u all is smooth in u:
+    s′(θ) = cos θ (1 + tanh u), and the energy (1 + s′²) θ̇²/2 gives t(u).
+    """
+    eta = 2 * excess + excess**2
+    root = np.sqrt(eta)
+    u0 = np.arcsinh(np.sin(angle) / root)
+    angle_of = lambda u: np.arcsin(root * np.sinh(u))
+    slope = lambda u: np.cos(angle_of(u)) * (1 + np.tanh(u))
+    momentum = np.sqrt(1 + slope(u0) ** 2) * rate
+    pace = lambda u: root * np.cosh(u) / np.cos(angle_of(u)) * np.sqrt(1 + slope(u) ** 2) / momentum
+    time_of = lambda u: sum(quad(pace, a, b, epsabs=1e-13, epsrel=1e-12)[0] for a, b in _pieces(u0, u))
+
+    def truth(times):
+        rows = []
+        for t in np.asarray(times, float):
+            u = u0 if t == 0 else brentq(lambda u, t=t: time_of(u) - t, -u0, u0, xtol=1e-13, rtol=1e-14)
+            speed = momentum / np.sqrt(1 + slope(u) ** 2)
+            # s = √η eᵘ, without cancellation.
+            rows.append(((angle_of(u), root * np.exp(u)), (speed, slope(u) * speed)))
+        q, v = zip(*rows, strict=True)
+        return np.array(q), np.array(v)
+
+    y0 = tuple(x[0] for x in truth([0.0]))
+    return Case(
+        f"dead centre at {excess:g}", SLIDER, y0, 0.6, truth, {"eta": np.asarray(eta)}, (1.0, 4.0), rate=4.0, steps=4000, chart=chart
+    )  # fmt: skip
+
+
+def _pieces(start, end):
+    points = np.linspace(start, end, max(int(abs(end - start)), 1) + 1)
+    return itertools.pairwise(points)
+
+
+def crossing(name, angle, rate, due, **rest):
+    """δ = 0: s = 2 sin θ, and (1 + 4 cos² θ) θ̇² stays."""
+    momentum = np.sqrt(1 + 4 * np.cos(angle) ** 2) * rate
+
+    def truth(times):
+        time_of = lambda x: quad(lambda y: np.sqrt(1 + 4 * np.cos(y) ** 2) / momentum, angle, x, epsabs=1e-14)[0]
+        ends = sorted((angle, angle + np.sign(rate) * 2.5)) if rate else (angle, angle)
+        rows = [
+            angle if t == 0 or not rate else brentq(lambda x, t=t: time_of(x) - t, *ends, xtol=1e-14) for t in times
+        ]
+        x = np.array(rows)
+        speed = momentum / np.sqrt(1 + 4 * np.cos(x) ** 2)
+        return np.stack([x, 2 * np.sin(x)], -1), np.stack([speed, 2 * np.cos(x) * speed], -1)
+
+    y0 = tuple(x[0] for x in truth([0.0]))
+    args = {"eta": np.asarray(0.0)}
+    return Case(name, SLIDER, y0, 0.6, truth, args, (1.0, 4.0), rate=4.0, steps=4000, due=due, **rest)
+
+
+def parallelogram():
+    """Cranks and base in one line: it goes on as a parallelogram, smoothly, or could change to an antiparallelogram."""
+    pivot = np.array([2.0, 0.0])
+
+    def constraint(t, q, args):
+        left, right = q[:2], q[2:] - pivot
+        bar = right - left + pivot
+        return jnp.stack([left @ left - 1, right @ right - 1, bar @ bar - 4]) / 2
+
+    swing = pendulum.exact(1.0, 5.0, 9.81)
+
+    def truth(times):
+        q, v = swing(times)
+        return np.concatenate([q, q + pivot], -1), np.concatenate([v, v], -1)
+
+    def force(t, q, v, args):
+        return jnp.array([0.0, 9.81, 0.0, 9.81])
+
+    y0 = tuple(x[0] for x in truth(np.zeros(1)))
+    system = dj.ConstrainedSystem(force, constraint)
+    return Case("parallelogram passes its change point", system, y0, 1.0, truth, size=(2.0, 6.0), rate=6.0, due="any")
+
+
+def pulled_apart():
+    """A joint on two unit rods, one from the origin, one from (1 + t, 0): straight at 1 s, and torn after."""
+
+    def constraint(t, q, args):
+        other = q - jnp.stack([1 + t, 0 * t])
+        return jnp.stack([q @ q - 1, other @ other - 1]) / 2
+
+    def truth(times):
+        x = (1 + np.asarray(times)) / 2
+        y = np.sqrt(1 - x**2)
+        return np.stack([x, y], -1), np.stack([0.5 + 0 * x, -x / (2 * y)], -1)
+
+    y0 = tuple(x[0] for x in truth(np.zeros(1)))
+    system = dj.ConstrainedSystem(no_force, constraint)
+    return Case("pulled beyond its reach", system, y0, 2.0, truth, due="failure", ends=1.0, steps=4000)
+
+
+def cases(quick):
+    """From afar to the singularity itself."""
+    return [
+        *(dead_centre(excess) for excess in (1e-1, 1e-3, 1e-6, 1e-9, 1e-12)),
+        crossing("dead centre exactly", 0.8, -2.0, "any", or_else=dead_centre(1e-15).truth),
+        crossing("from 1e-6 off the dead centre", 1e-6, 2.0, "any"),
+        crossing("from the dead centre", 0.0, 2.0, "refusal"),
+        parallelogram(),
+        pulled_apart(),
+    ]
