@@ -59,9 +59,11 @@ class Violation(eqx.Module):
 def violation(ode: MechanicalODE, t: Any, y: Any) -> Violation:
     """How far the flat state y = (q, v) is from the manifold."""
     q, v = y
-    root = jnp.finfo(q.dtype).eps ** 0.5
-    allowed = tuple(root * (1 + jnp.max(jnp.abs(x))) for x in (q, v))
-    return Violation(ode.invariants(t, y), ode.distances(t, y), allowed)
+    eps = jnp.finfo(q.dtype).eps
+    allowed, at_velocity = (eps**0.5 * (1 + jnp.max(jnp.abs(x))) for x in (q, v))
+    # A mechanism of micrometres: what is more than a part of itself off is no round-off, whatever the unit.
+    allowed = jnp.minimum(allowed, jnp.maximum(eps**0.25 * jnp.max(jnp.abs(q)), 1e4 * eps))
+    return Violation(ode.invariants(t, y), ode.distances(t, y), (allowed, at_velocity))
 
 
 class Unsolved(eqx.Module):

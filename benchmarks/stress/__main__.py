@@ -7,9 +7,10 @@ from pathlib import Path
 
 from dae_jax.app import options
 
-from . import page
+from . import growth, page
 from .cases import METHODS
 from .families import FAMILIES, SCENE, cases_of
+from .record import Record
 from .runner import LIMIT, run
 
 
@@ -31,7 +32,12 @@ def main(argv=None):
         "--quick", action="store_true", help="a smoke test: few methods and stressors, under two minutes"
     )
     parser.add_argument("--limit", type=float, default=LIMIT, help=f"seconds for a cell; by default {LIMIT}")
-    parser.add_argument("--out", type=Path, default=Path("stress"), help="folder for table, page and figures")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("stress"),
+        help="folder for table, page and figures; what it has of other stressors and methods stays",
+    )
     arguments = parser.parse_args(argv)
     options.refuse_not_positive(parser, **{"--limit": arguments.limit})
     if arguments.scenes and arguments.stressors:
@@ -42,25 +48,26 @@ def main(argv=None):
     families = _names(parser, "family", arguments.stressors, FAMILIES, QUICK_FAMILIES if arguments.quick else FAMILIES)
     families = [SCENE + scene for scene in arguments.scenes] or families
     options.writable(parser, arguments.out)
-    cells, grown, drawn, begin = [], {}, [], time.perf_counter()
+    record, count, begin = Record.read(arguments.out), 0, time.perf_counter()
     try:
         for family in families:
             cases = cases_of(family, arguments.quick)
             todo = [(case.name, name) for name in methods for case in cases if case.applies(name)]
             for cell, series in run(family, todo, arguments.quick, arguments.limit):
                 print(_line(cell), flush=True)
-                cells.append(cell)
-                if series:
-                    grown[cell.stressor, cell.method] = series
+                count += 1
+                record.add(cell, growth.laws(series) if series else None)
             if hasattr(FAMILIES.get(family), "figures"):
-                drawn += FAMILIES[family].figures(arguments.out, arguments.quick, cells)
+                record.figures |= FAMILIES[family].figures(arguments.out, arguments.quick, record.of(family))
+            record.seconds[family] = time.perf_counter() - begin
+            begin = time.perf_counter()
+            record.write(arguments.out)
+            page.write(record, arguments.out)
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"{len(cells)} cells are done and kept in {arguments.out}") from None
-    finally:
-        if cells:
-            written = page.write(cells, grown, drawn, arguments.out, time.perf_counter() - begin)
-    print(page.counts(cells), *written, sep="\n")
-    return int(any(cell.verdict == "WRONG" for cell in cells))
+        record.write(arguments.out)
+        raise KeyboardInterrupt(f"{count} cells are done and kept in {arguments.out}") from None
+    print(page.counts(record.cells), *(arguments.out / name for name in page.NAMES), sep="\n")
+    return int(any(cell.verdict == "WRONG" for cell in record.cells))
 
 
 def _names(parser, kind, given, known, default):

@@ -1,16 +1,17 @@
 """What the command writes: the table as CSV, the page as markdown, the map as a figure."""
 
-import csv
-import dataclasses
 import re
 from collections import Counter
 
 from . import figure, growth
-from .cases import METHODS, ON_THE_CONSTRAINTS
+from .cases import METHODS, ON_THE_CONSTRAINTS, SYMMETRIC
 from .families import FAMILIES
-from .judge import WRONG, Cell
+from .judge import WRONG
+from .record import TABLE
 
 
+PAGE, MAP = "stress.md", "stress.png"
+NAMES = (TABLE, PAGE, MAP)
 VERDICTS = ("ok", "degraded", "refused", "failed", "WRONG")
 HEAD = """# What each method can take
 
@@ -32,24 +33,19 @@ scipy at 1e-13. Errors are relative to the size of the motion, and drift is |g| 
 """
 
 
-def write(cells, grown, drawn, folder, seconds):
-    """The paths of what was written."""
-    paths = [folder / "stress.csv", folder / "stress.md", folder / "stress.png"]
-    with paths[0].open("w", newline="") as file:
-        table = csv.DictWriter(file, [field.name for field in dataclasses.fields(Cell)])
-        table.writeheader()
-        table.writerows(map(dataclasses.asdict, cells))
+def write(record, folder):
+    """The page and the map."""
+    cells, minutes = record.cells, sum(record.seconds.values()) / 60
     text = [
-        HEAD.format(count=len(cells), minutes=seconds / 60),
+        HEAD.format(count=len(cells), minutes=minutes),
         _counted(cells),
-        _statements(cells),
-        growth.table(grown),
+        _statements(record),
+        growth.table(record.growth),
     ]
-    for family in dict.fromkeys(cell.family for cell in cells):
-        text.append(_family(family, [cell for cell in cells if cell.family == family]))
-    paths[1].write_text("\n".join(filter(None, text)))
-    figure.table(cells).savefig(paths[2])
-    return paths
+    text += [f"{said}\n\n![{said.split(':')[0]}]({name})\n" for name, said in record.figures.items()]
+    text += [_family(family, record.of(family)) for family in dict.fromkeys(cell.family for cell in cells)]
+    (folder / PAGE).write_text("\n".join(filter(None, text)))
+    figure.table(cells).savefig(folder / MAP)
 
 
 def counts(cells):
@@ -67,22 +63,25 @@ def _counted(cells):
     return "\n".join(["## Cells by verdict", "", *lines, ""])
 
 
-def _statements(cells):
+def _statements(record):
     """What is promised, and whether the table shows it."""
+    cells = record.cells
     okay = [cell for cell in cells if cell.verdict == "ok" and cell.ended == "answer"]
     lines = ["## What is promised", ""]
     off = [
-        cell
-        for cell in okay
-        if cell.method in ON_THE_CONSTRAINTS and cell.drift >= 0 and "float32" not in cell.stressor
+        cell for cell in okay if cell.method in ON_THE_CONSTRAINTS and cell.drift >= 0 and cell.stressor != "float32"
     ]
-    if off:
-        worst = max(off, key=lambda cell: cell.drift)
-        kept = sum(cell.drift <= 1e-11 for cell in off)
+    for method in dict.fromkeys(cell.method for cell in off):
+        mine = [cell for cell in off if cell.method == method]
+        worst = max(mine, key=lambda cell: cell.drift)
         lines.append(
-            f"- {', '.join(m for m in ON_THE_CONSTRAINTS)} are on the constraints to 1e-11 in {kept} of the {len(off)} cells that "
-            f"they pass in float64; the largest drift is {worst.drift:.0e} ({worst.method}, {worst.stressor})."
+            f"- {method} is on the constraints to 1e-11 in {sum(cell.drift <= 1e-11 for cell in mine)} of the {len(mine)} cells that "
+            f"it passes in float64; the largest drift is {worst.drift:.0e} ({worst.stressor})."
         )
+    for stressor, by in record.growth.items():
+        trends = [f"{method} {by[method]['trend of the energy']:.2f}" for method in SYMMETRIC if method in by]
+        if trends:
+            lines.append(f"- The trend of the energy, as a part of its swing, {stressor}: {', '.join(trends)}.")
     if okay:
         worst = max(okay, key=lambda cell: cell.error / cell.allowed)
         lines.append(

@@ -53,7 +53,7 @@ def solved(case: Case, name: str) -> Outcome:
         return Outcome("refused", " ".join(str(refusal).split()), seconds=time.perf_counter() - begin)
     taken = {"steps": steps, "end": end, "seconds": time.perf_counter() - begin}
     if code not in OKAY:
-        return Outcome("failed", str(in_words(sol)), **taken)
+        return Outcome("failed" if end > 0 else "refused", str(in_words(sol)), **taken)
     q, v = map(np.asarray, sol.ys)
     errors = min(
         (_errors(case, q, v, _known(truth, case.t1, case.times)) for truth in (case.truth, case.or_else) if truth),

@@ -29,6 +29,13 @@ def test_the_command_writes_table_page_and_map(tmp_path, capsys):
     assert "violates the constraints" in said
     assert (tmp_path / "stress.png").stat().st_size > 10_000
     assert "5 ok, 0 degraded, 0 refused, 0 failed, 0 WRONG" in capsys.readouterr().out
+    # Another method is added to what is there.
+    argv[argv.index("rattle")] = "state-space"
+    assert main(argv) == 0
+    assert "10 ok, 0 degraded" in capsys.readouterr().out
+    said = (tmp_path / "stress.md").read_text()
+    assert "| rattle | 5 |" in said
+    assert "| state-space | 5 |" in said
 
 
 def test_a_cell_without_an_answer_is_an_entry_and_the_next_ones_are_solved():

@@ -2,6 +2,9 @@
 with `figures(folder, quick, cells)` draws, and gives the names and what they show.
 """
 
+import functools
+
+from ..cases import METHODS
 from . import any_scene, baumgarte, broken, extremes, horizons, loops, precision, scales, singular, steps
 
 
@@ -25,3 +28,16 @@ def cases_of(family, quick):
     if family.startswith(SCENE):
         return any_scene.cases(family.removeprefix(SCENE), quick)
     return FAMILIES[family].cases(quick)
+
+
+def order(family, stressor, method):
+    """Families, stressors and methods as they are listed; scenes and what is no more listed come last."""
+    families, methods = list(FAMILIES), list(METHODS)
+    stressors = _stressors(family)
+    place = lambda x, known: known.index(x) if x in known else len(known)
+    return place(family, families), family, place(stressor, stressors), stressor, place(method, methods)
+
+
+@functools.cache
+def _stressors(family):
+    return list(dict.fromkeys(case.name for case in cases_of(family, False)))

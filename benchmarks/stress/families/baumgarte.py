@@ -122,7 +122,7 @@ def figures(folder, quick, cells):
         f"{low:.3f} to {high:.3f} times that of theory, and the drift of a start that is off decays as the roots say, to "
         f"{decay():.0e} of it."
     )
-    return [("stress-baumgarte.png", said)]
+    return {"stress-baumgarte.png": said}
 
 
 def draw(values, theory, found, ratio):

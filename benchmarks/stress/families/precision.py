@@ -36,7 +36,7 @@ def figures(folder, quick, cells):
         if cell.stressor.startswith("tolerance") and cell.ended == "answer":
             curves.setdefault(cell.method, []).append((float(cell.stressor.split()[1]), cell.error))
     if not curves:
-        return []
+        return {}
     shown = Figure(figsize=(7.2, 4.8), layout="constrained", dpi=160)
     axes = shown.subplots()
     ends = np.array([TOLERANCES[-1], TOLERANCES[0]])
@@ -55,4 +55,4 @@ def figures(folder, quick, cells):
     }
     low, high = (f"{steepest[m]:.2f} ({m})" for m in (min(steepest, key=steepest.get), max(steepest, key=steepest.get)))
     said = f"Error against tolerance on a double pendulum: the errors fall with powers of the tolerance from {low} to {high}."
-    return [("stress-tolerances.png", said)]
+    return {"stress-tolerances.png": said}

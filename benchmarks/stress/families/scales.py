@@ -2,6 +2,8 @@
 A double pendulum, which also starts folded, with its tip at its pivot, where its constraints are not singular.
 """
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -86,7 +88,10 @@ def cases(quick):
     small = {"as it is": {}, "masses 1e8": {"masses": (1e8, 1e8)}, "masses 1e-8": {"masses": (1e-8, 1e-8)}}
     if quick:
         return [two_rods(name, **what) for name, what in small.items()]
-    return [two_rods(name, **what) for name, what in {**small, **MORE}.items()]
+    found = [two_rods(name, **what) for name, what in {**small, **MORE}.items()]
+    tiny = next(case for case in found if case.name == "lengths 1e-6")
+    off = {"y0": (tiny.y0[0] * 1.01, tiny.y0[1]), "off": 1e-2, "due": "refusal"}
+    return [*found, dataclasses.replace(tiny, name="lengths 1e-6, off by 1 %", **off)]
 
 
 MORE = {
