@@ -4,7 +4,7 @@ from .cases import METHODS
 
 
 LOST = 8
-SILENT = "#C9CDD2"
+GOOD, SILENT, WRONG = "#3E8E7E", "#C9CDD2", "#5B0A1E"
 
 
 def table(cells):
@@ -26,12 +26,12 @@ def table(cells):
     height = 0.21 * (at + 1) + 2.6
     shown = Figure(figsize=(max(3.9 + 0.36 * len(methods), 6.4), height), layout="constrained", dpi=160)
     axes = shown.subplots()
-    colours = LinearSegmentedColormap.from_list("lost", ["#3E8E7E", "#E9D8A6", "#EE9B00", "#AE2012"])
+    colours = LinearSegmentedColormap.from_list("lost", ["#DDE5B0", "#EFC75E", "#E8871E", "#AE2012"])
     norm = Normalize(0, LOST)
     for cell in cells:
         x, y = methods.index(cell.method), place[cell.family, cell.stressor]
         undue = cell.ended != "answer" and cell.verdict in ("refused", "failed")
-        colour = SILENT if undue else "#5B0A1E" if cell.verdict == "WRONG" else colours(norm(cell.lost))
+        colour = SILENT if undue else WRONG if cell.verdict == "WRONG" else GOOD if cell.lost == 0 else colours(norm(cell.lost))
         axes.add_patch(_square(x, y, colour))
         marker = "x" if cell.verdict == "WRONG" else {"refused": "s", "failed": "^"}.get(cell.ended)
         if marker:
@@ -56,16 +56,16 @@ def table(cells):
     for side in axes.spines.values():
         side.set_visible(False)
     bar = shown.colorbar(ScalarMappable(norm, colours), ax=axes, location="bottom", aspect=40, shrink=0.6, pad=0.01)
-    bar.set_label("digits lost below a thousand tolerances", fontsize=7.5)
+    bar.set_label("digits lost beyond what is allowed", fontsize=7.5)
     bar.ax.tick_params(labelsize=7)
     bar.outline.set_visible(False)
     ink = {"linestyle": "none", "markersize": 5, "markeredgewidth": 1.4}
     handles = [
-        Patch(color=colours(0.0), label="an answer"),
+        Patch(color=GOOD, label="all digits that were asked for"),
         Line2D([], [], marker="s", color="#3A3F45", markerfacecolor="none", label="refused in words", **ink),
         Line2D([], [], marker="^", color="#3A3F45", markerfacecolor="none", label="failed in words", **ink),
         Patch(color=SILENT, label="no answer, where there is one"),
-        Line2D([], [], marker="x", color="#5B0A1E", label="WRONG: no two digits, no word", **ink),
+        Line2D([], [], marker="x", color=WRONG, label="WRONG: no two digits, no word", **ink),
     ]
     shown.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=7.5)
     return shown
