@@ -138,6 +138,10 @@ class LinearisedResidual(eqx.Module):
         factors, smallest = self.storage.factor(matrix)
         return (factors, scale, c), smallest
 
+    def round_off(self, j: Array, m: Array, c: Any, size: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The round-off of each equation, (|J| + |c M|) ε, for variables of that `size`."""
+        return self.storage.apply(jnp.abs(j) + jnp.abs(c * m), size) * jnp.finfo(size.dtype).eps
+
     def column_scale(self, h: Any) -> Float[Array, " n"]:
         """h^dⱼ."""
         return powers(jnp.minimum(jnp.abs(h), 1), self.structure.offsets)

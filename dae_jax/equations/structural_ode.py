@@ -146,9 +146,15 @@ class StructuralODE(ManifoldODE):
         which of these are numbers.
         """
         time, state, y = (jax.ShapeDtypeStruct(shape, dtype) for shape in ((), (self.orders.size,), (self.form.size,)))
-        coefficients = lambda t, s, x: jax.jacfwd(lambda x: self.of_highest_order(t, s, x))(x)
-        (*_, on_highest), known = interpreted(coefficients, time, state, y, derivative=True)
-        return not on_highest.any(), known.reshape(self.form.size, self.form.size)
+
+        def coefficients(t: Any, s: Any, x: Any) -> Any:
+            twice = lambda x: (value := self.of_highest_order(t, s, x), value)
+            return jax.jacfwd(twice, has_aux=True)(x)
+
+        found = interpreted(coefficients, time, state, y)
+        n = self.form.size
+        linear = not (found.on[2][: n * n].any() or found.jumps[2].any())
+        return linear, found.numbers[: n * n].reshape(n, n)
 
     # The equations and their derivatives
 

@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import structural_rank
 
 from ..equations.derivative_orders import find_offsets
 from ..equations.residual_form import Form, ResidualForm
-from ..structure import interpreted
+from ..structure import dependence
 
 
 def why_not_as_written(system: Any, t: Any, state: Any, args: Any, form: Form, highest: int) -> str:
@@ -38,7 +38,7 @@ def why_not_as_written(system: Any, t: Any, state: Any, args: Any, form: Form, h
     if found.index < 2 or structural_rank(csr_array(found.by_rate)) == occurs.sum():
         return ""
     y, time = jax.ShapeDtypeStruct((residual.size,), dtype), jax.ShapeDtypeStruct((), dtype)
-    on, _ = interpreted(jax.jacfwd(residual.residual, 2), time, y, y, derivative=True)
+    on = dependence(jax.jacfwd(residual.residual, 2), time, y, y, derivative=True)
     if not np.concatenate(on, 1).any():
         return ""
     return (

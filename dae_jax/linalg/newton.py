@@ -41,7 +41,8 @@ def newton(
 
     Corrections δₖ are made until what remains, δₖ²/δₖ₋₁ by the observed rate of convergence, is round-off, or until
     they no longer shrink and are within 1000 times of it (the residual's own round-off, amplified by an ill-conditioned
-    Jacobian). The solution is differentiated implicitly, dx = −(∂F/∂x)⁻¹ ∂F/∂params dparams, in both modes and to any
+    Jacobian). A first correction says nothing of that, unless it is round-off itself: where F is steep it is small
+    however far the solution is. The solution is differentiated implicitly, dx = −(∂F/∂x)⁻¹ ∂F/∂params dparams, in both modes and to any
     order; `x0` has no derivative.
     """
 
@@ -69,7 +70,7 @@ def fixed_point(
 ) -> tuple[Any, Bool[Array, ""]]:
     """Applies `correct`: x ↦ (x, relative size of the correction) until what remains is round-off; see `newton`.
 
-    `last`: the size of the correction that led to `x`, where one has been made.
+    `last`: the size of the correction δ that led to `x`, where one has been made that is known to leave about δ² behind.
     """
     dtype = jnp.result_type(*jax.tree.leaves(x))
     tolerance = roundoff(dtype)
@@ -77,9 +78,13 @@ def fixed_point(
     noise = float(jnp.finfo(dtype).eps) ** 0.55
     one = jnp.ones((), dtype)
 
+    proves_nothing = last is None
+
     def unfinished(carry: Any) -> Bool[Array, ""]:
         _, last, previous, count = carry
         remaining = last * jnp.minimum(last / previous, 1)
+        if proves_nothing:
+            remaining = jnp.where(count == 1, last, remaining)
         stagnant = (last > previous / 2) & (last < 1000 * tolerance) | (last >= previous) & (last < noise)
         # A NaN compares false and ends the loop.
         return (count < max_steps) & (remaining > tolerance) & ~stagnant
@@ -87,7 +92,7 @@ def fixed_point(
     def body(carry: Any) -> Any:
         x, last, _, count = carry
         x, size = correct(x)
-        # The correction before the first counts as 1, so that a first correction δ is expected to leave δ² behind.
+        # The correction before the first counts as 1, as if it left δ² behind.
         return x, size, jnp.where(last < jnp.inf, jnp.maximum(last, jnp.finfo(dtype).tiny), one), count + 1
 
     start = (x, jnp.full((), jnp.inf, dtype), one, 0) if last is None else (x, last, one, 1)

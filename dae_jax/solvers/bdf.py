@@ -13,6 +13,7 @@ from ..linalg import implicit_root, rms_norm
 from .manifold import time_sign
 from .residual_steps import (
     AbstractResidualSolver,
+    Iteration,
     Tolerances,
     at_min_step,
     constant,
@@ -86,6 +87,13 @@ class _State(NamedTuple):
     eta: Float[Array, ""]
 
 
+class _Factors(NamedTuple):
+    """The factors of the iteration `matrix`, and what may be `round_off` of each equation."""
+
+    matrix: Any
+    round_off: Float[Array, " n"]
+
+
 class _Step(NamedTuple):
     """The equation of a step, 0 = F(t₁, y, ẏ*+ c (y − y*)): a pytree, so that it can be differentiated."""
 
@@ -101,10 +109,11 @@ class _Step(NamedTuple):
         """F at the new point."""
         return self.linearised.residual(self.sign * self.t1, y, self.sign * (self.rate + self.c * (y - self.y)))
 
-    def factor(self, y: Float[Array, " n"]) -> tuple[Any, Float[Array, ""]]:
+    def factor(self, y: Float[Array, " n"], tol: Tolerances) -> tuple[_Factors, Float[Array, ""]]:
         """The factors of ∂F/∂y + c ∂F/∂ẏ, and the smallest pivot."""
         j, m = self.linearised.jacobians(self.sign * self.t1, y, self.sign * (self.rate + self.c * (y - self.y)))
-        return self.linearised.factor(j, m, self.sign * self.c, self.h)
+        factors, pivot = self.linearised.factor(j, m, self.sign * self.c, self.h)
+        return _Factors(factors, tol.round_off(self.linearised, j, m, self.c, self.y)), pivot
 
 
 class BDF(AbstractResidualSolver):
@@ -152,7 +161,8 @@ class BDF(AbstractResidualSolver):
     def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> _State:
         sign = time_sign(terms, t0, t1)
         like = _Step(args, sign, t1, t1 - t0, 1 / (t1 - t0), y0, y0)
-        factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda: like.factor(y0)[0]))
+        tol = tolerances(self.rtol, self.atol, y0.dtype)
+        factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda: like.factor(y0, tol)[0]))
         return _start(sign * args.start, factors)
 
     def invalidate_jacobian(self, state: _State) -> _State:
@@ -176,7 +186,9 @@ class BDF(AbstractResidualSolver):
             lambda params: _solve(*params),
             (_Step(args, sign, t1, h, method.c, y, rate), *constant((y0, state, is_smallest(t0, t1))), tol),
             linear_solve=lambda inverse, b: inverse(b),
-            jacobian=lambda y, params: functools.partial(params[0].linearised.solve, params[0].factor(y)[0]),
+            jacobian=lambda y, params: functools.partial(
+                params[0].linearised.solve, params[0].factor(y, params[2])[0].matrix
+            ),
         )
         # Row j of the new differences is the change and all rows from j to k; rows above k are not used yet, or are φₖ₊₁.
         phi = [y1 - y]
@@ -279,14 +291,16 @@ def _solve(step: _Step, y0: Any, state: _State, smallest: Any, tol: Tolerances) 
         tries, fresh, before, factors, _ = carry
         renew = (tries > 0) | changed
         start = start_of(tries, step.y, before.x)
-        factors, pivot = lax.cond(renew, lambda: step.factor(start), lambda: (factors, jnp.full_like(step.c, jnp.inf)))
-        correction = lambda y: -step.linearised.solve(factors, step.residual(y))
+        new = lambda: step.factor(start, tol)
+        factors, pivot = lax.cond(renew, new, lambda: (factors, jnp.full_like(step.c, jnp.inf)))
+        correction = lambda residual: -step.linearised.solve(factors.matrix, residual)
+        iteration = Iteration(step.residual, correction, factors.round_off)
         scale = lambda y: weights / tol.scale(y0, y)
         eta = jnp.where(renew, 1, state.eta)
         newton = lax.cond(
             smallest & (tries > 0),
-            lambda: corrected(correction, start, tries, scale, differential, eta, tol),
-            lambda: simplified_newton(correction, start, weights / tol.scale(y0), eta, tol),
+            lambda: corrected(iteration, start, tries, scale, differential, eta, tol),
+            lambda: simplified_newton(iteration, start, weights / tol.scale(y0), eta, tol),
         )
         return tries + 1, fresh | renew, newton, factors, pivot
 

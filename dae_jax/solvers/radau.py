@@ -27,6 +27,7 @@ from .radau_coefficients import (
 )
 from .residual_steps import (
     AbstractResidualSolver,
+    Iteration,
     Tolerances,
     at_min_step,
     constant,
@@ -91,6 +92,14 @@ class _State(NamedTuple):
     eta: Float[Array, ""]
 
 
+class _Factors(NamedTuple):
+    """The factors of the `real` and the `complex` iteration matrix, and what may be `round_off` of each equation."""
+
+    real: Any
+    complex: Any
+    round_off: Float[Array, " n"]
+
+
 class _Step(NamedTuple):
     """The equations of a step: a pytree, so that they can be differentiated.
 
@@ -134,26 +143,26 @@ class _Step(NamedTuple):
         found = lax.map(lambda stage: fn(*stage), jax.tree.map(lambda *x: jnp.stack(x), *stages))
         return [jax.tree.map(lambda x, i=i: x[i], found) for i in range(3)]
 
-    def residuals(self, z: Float[Array, "3 n"]) -> list[Float[Array, " n"]]:
+    def residuals(self, z: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
         """F at the stages."""
-        return self.at_stages(self.linearised.residual, z)
+        return jnp.stack(self.at_stages(self.linearised.residual, z))
 
     def jacobians(self, t: Any, y: Any, yd: Any) -> tuple[Any, Any]:
         """∂F/∂y and ∂F/∂(dy/dτ) for the loop's own time τ = ± t."""
         j, m = self.linearised.jacobians(t, y, yd)
         return j, self.sign * m
 
-    def factor(self, jacobians: Any) -> tuple[Any, Float[Array, ""]]:
+    def factor(self, jacobians: Any, tol: Tolerances) -> tuple[_Factors, Float[Array, ""]]:
         """The factors of γ/h M + J, in the smallest step of M/h + J, and of (α + iβ)/h M + J, and the smallest pivot."""
         j, m = jacobians
         real, pivot = self.linearised.factor(j, m, jnp.where(self.smallest, 1, GAMMA) / self.h, self.h)
         both, other = self.linearised.factor(j, m, lax.complex(ALPHA / self.h, BETA / self.h), self.h)
-        return (real, both), jnp.minimum(pivot, other)
+        round_off = tol.round_off(self.linearised, j, m, 1 / self.h, self.y0)
+        return _Factors(real, both, round_off), jnp.minimum(pivot, other)
 
-    def correction(self, factors: Any, z: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+    def correction(self, factors: _Factors, residuals: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
         """Δz of simplified Newton, decoupled into a real and a complex system."""
-        real, both = factors
-        residuals = self.residuals(z)
+        real, both, _ = factors
         first, second, third = _combined(BACK, residuals)
         w = self.linearised.solve(real, jnp.where(self.smallest, residuals[2], first))
         v = self.linearised.solve(both, lax.complex(second, third))
@@ -208,7 +217,8 @@ class RadauIIA5(AbstractResidualSolver):
         sign = time_sign(terms, t0, t1)
         zero = jnp.zeros((), y0.dtype)
         step = _Step(args, sign, t0, t1, y0)
-        unused = jax.eval_shape(lambda: (j := step.jacobians(t0, y0, y0), step.factor(j)[0]))
+        tol = tolerances(self.rtol, self.atol, y0.dtype)
+        unused = jax.eval_shape(lambda: (j := step.jacobians(t0, y0, y0), step.factor(j, tol)[0]))
         jacobians, factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), unused)
         return _State(
             jnp.zeros((3, y0.size), y0.dtype), zero, args.start, jacobians, factors, zero, jnp.asarray(True), zero + 1
@@ -226,7 +236,7 @@ class RadauIIA5(AbstractResidualSolver):
         # The unknowns of a stage are interleaved, so that a band stays one.
         apart = lambda z: z.reshape(-1, 3).T
         flat, (newton, jacobians, factors, pivot) = implicit_root(
-            lambda z, params: jnp.stack(params[0].residuals(apart(z)), 1).reshape(-1),
+            lambda z, params: params[0].residuals(apart(z)).T.reshape(-1),
             lambda params: _solve(*params),
             (step, constant(state), tol),
             linear_solve=_linear_solve,
@@ -234,7 +244,7 @@ class RadauIIA5(AbstractResidualSolver):
         )
         z = apart(flat)
         y1 = y0 + z[2]
-        scaled = counted = _error(*constant((step, factors[0], z)), tol) * args.weights(step.h)
+        scaled = counted = _error(*constant((step, factors.real, z)), tol) * args.weights(step.h)
         if args.between(self.dense).any():
             weights = args.weights(step.h, tol.raised()) * args.between(self.dense)
             between = _between(*constant((state, step.h, z))) * weights
@@ -278,14 +288,17 @@ def _solve(step: _Step, state: _State, tol: Tolerances) -> Any:
         jacobians = lax.cond(renew, evaluate, lambda: jacobians)
         infinite = jnp.full_like(h, jnp.inf)
         factors, pivot = lax.cond(
-            renew | (h != state.factored), lambda: step.factor(jacobians), lambda: (factors, infinite)
+            renew | (h != state.factored),
+            lambda: step.factor(jacobians, tol),
+            lambda: (factors, infinite),
         )
-        correction = lambda z: step.correction(factors, z)
+        correction = lambda residuals: step.correction(factors, residuals)
+        iteration = Iteration(step.residuals, correction, factors.round_off)
         scale = lambda z: weights / tol.scale(step.y0, step.y0 + z[2])
         newton = lax.cond(
             smallest & (tries > 0),
-            lambda: corrected(correction, start, tries, scale, differential, state.eta, tol),
-            lambda: simplified_newton(correction, start, weights / tol.scale(step.y0), state.eta, tol),
+            lambda: corrected(iteration, start, tries, scale, differential, state.eta, tol),
+            lambda: simplified_newton(iteration, start, weights / tol.scale(step.y0), state.eta, tol),
         )
         return tries + 1, fresh | renew, newton, jacobians, factors, pivot
 

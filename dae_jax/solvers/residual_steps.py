@@ -16,6 +16,9 @@ from ..linalg import rms_norm, roundoff
 
 # The part of the tolerance that round-off may use up (BCP, section 5.2.2).
 NOISE = 0.33
+# What a correction may leave of an equation, in parts of what it changes there; and what of it may be round-off, in parts of
+# its terms and of the resolution of numbers.
+LEFT, OFF = 2, 1000
 # Round-off of the divided differences of algebraic variables, in parts of the variables over h.
 NOISY = 1000
 # How often a correction is halved where algebraic variables jump.
@@ -78,6 +81,10 @@ class Tolerances(NamedTuple):
             largest = jnp.maximum(largest, jnp.abs(y))
         return self.atol + self.rtol * largest
 
+    def round_off(self, linearised: Any, j: Any, m: Any, c: Any, y: Float[Array, " n"]) -> Float[Array, " n"]:
+        """What each equation may be off by for certain, where the iteration matrix is J + c M."""
+        return OFF * linearised.round_off(j, m, c, jnp.abs(y) + self.atol)
+
     def norm(self, error: Any, *ys: Any) -> Float[Array, ""]:
         """The size of an error; 1 is allowed."""
         return rms_norm(error / self.scale(*ys))
@@ -123,19 +130,43 @@ def not_begun(start: Any, eta: Any) -> Newton:
     return Newton(start, 0, zero, eta, zero, no, no, no)
 
 
-def simplified_newton(correction: Callable[[Any], Any], start: Any, scale: Any, eta: Any, tol: Tolerances) -> Newton:
+class Iteration(NamedTuple):
+    """F(x), the solution of A Δx = −F for the iteration matrix A at hand, and what of F may be `round_off`."""
+
+    residual: Callable[[Any], Any]
+    correction: Callable[[Any], Any]
+    round_off: Any
+
+    def next(self, x: Any) -> Any:
+        """The correction at x."""
+        return self.correction(self.residual(x))
+
+    def after(self, x: Any, dx: Any) -> tuple[Any, Any]:
+        """F at x, and whether the size of the correction Δx that led there says how far the solution is: by a matrix from
+        where F was steep it is small wherever that is. Each equation has to be one that about as much more of Δx puts right,
+        by its slope at x, or right to round-off.
+        """
+        left, change = jax.jvp(self.residual, (x,), (dx,))
+        return left, jnp.all(jnp.abs(left) <= jnp.maximum(LEFT * jnp.abs(change), self.round_off))
+
+
+def simplified_newton(iteration: Iteration, start: Any, scale: Any, eta: Any, tol: Tolerances) -> Newton:
     """Corrects `start` until what remains, η ‖Δx‖, is small beside the tolerance; ‖Δx‖ is that of Δx · `scale`.
 
     Source: E. Hairer, G. Wanner, *Solving Ordinary Differential Equations II*, section IV.8.
     """
     epsilon = jnp.finfo(start.dtype).eps
 
-    def goes_on(s: Newton) -> Any:
+    def goes_on(carry: Any) -> Any:
+        s, _ = carry
         return ~s.converged & ~s.diverged & (s.count < tol.corrections)
 
-    def correct(s: Newton) -> Newton:
-        dx = correction(s.x)
+    def correct(carry: Any) -> Any:
+        s, off = carry
+        dx = iteration.correction(off)
+        x = s.x + dx
         size = rms_norm(dx * scale)
+        left, trusted = iteration.after(x, dx)
         theta = size / jnp.maximum(s.last, jnp.finfo(start.dtype).tiny)
         first = s.count == 0
         eta = jnp.where(first, jnp.maximum(s.eta, 1e-3) ** 0.8, theta / jnp.maximum(1 - theta, epsilon))
@@ -143,12 +174,13 @@ def simplified_newton(correction: Callable[[Any], Any], start: Any, scale: Any, 
         stagnant = ~first & (theta >= 1)
         hopeless = stagnant | (eta * size * theta**remaining > tol.newton) & (size > NOISE)
         # A correction that does not shrink any more but is small is round-off.
-        converged = (eta * size <= tol.newton) & ~stagnant | (size <= tol.roundoff) | (stagnant & (size <= NOISE))
+        small = (eta * size <= tol.newton) & ~stagnant | (size <= tol.roundoff) | (stagnant & (size <= NOISE))
+        converged = small & trusted
         diverged = ~jnp.isfinite(size) | (~first & hopeless & ~converged & (not tol.patient))
         theta = jnp.where(first, 0, theta)
-        return Newton(s.x + dx, s.count + 1, size, eta, theta, converged & jnp.isfinite(size), diverged, s.carried)
+        return Newton(x, s.count + 1, size, eta, theta, converged & jnp.isfinite(size), diverged, s.carried), left
 
-    return lax.while_loop(goes_on, correct, not_begun(start, eta))
+    return lax.while_loop(goes_on, correct, (not_begun(start, eta), iteration.residual(start)))[0]
 
 
 def goes_on(tries: Any, converged: Any, fresh: Any, smallest: Any) -> Any:
@@ -162,7 +194,7 @@ def start_of(tries: Any, predicted: Any, before: Any) -> Any:
 
 
 def corrected(
-    correction: Callable[[Any], Any],
+    iteration: Iteration,
     x: Any,
     tries: Any,
     scale: Callable[[Any], Any],
@@ -176,21 +208,23 @@ def corrected(
 
     Source: P. Deuflhard, *Newton Methods for Nonlinear Problems*, sec. 3.1.4 (the restricted monotonicity test).
     """
-    dx = correction(x)
+    dx = iteration.next(x)
     scale_there = scale(x + dx)
     size = rms_norm(dx * scale_there)
 
     def halve(carry: Any) -> Any:
         part, *_, count = carry
-        ahead = rms_norm(correction(x + part * dx) * scale_there)
+        left, trusted = iteration.after(x + part * dx, dx)
+        ahead = rms_norm(iteration.correction(left) * scale_there)
         taken = (tries > DAMPED) | (ahead <= (1 - part / 2) * size)
-        return jnp.where(taken, part, part / 2), ahead, taken, count + 1
+        return jnp.where(taken, part, part / 2), ahead, taken, trusted, count + 1
 
-    begin = jnp.ones((), x.dtype), jnp.asarray(jnp.inf, x.dtype), jnp.asarray(False), 0
-    part, ahead, taken, _ = lax.while_loop(lambda carry: ~carry[2] & (carry[3] < HALVINGS), halve, begin)
+    no = jnp.asarray(False)
+    begin = jnp.ones((), x.dtype), jnp.asarray(jnp.inf, x.dtype), no, no, 0
+    part, ahead, taken, trusted, _ = lax.while_loop(lambda carry: ~carry[2] & (carry[4] < HALVINGS), halve, begin)
     # Corrections that are round-off grow and shrink as they please.
     noise = (size <= tol.roundoff) | ~(ahead < size) & (size <= NOISE)
-    converged = (ahead <= tol.newton) & taken & (part == 1) | noise
+    converged = trusted & ((ahead <= tol.newton) & taken & (part == 1) | noise)
     x = jnp.where(taken | converged, x + part * dx, x)
     finite = jnp.isfinite(size)
     carried = finite & (rms_norm(dx * scale_there * differential) <= NOISE)

@@ -2,7 +2,13 @@
 
 from .blocks import Block as Block, block_triangular as block_triangular
 from .colouring import column_colouring as column_colouring, seed_matrix as seed_matrix
-from .incidence import dependence as dependence, interpreted as interpreted, signature as signature
+from .incidence import (
+    Interpretation as Interpretation,
+    dependence as dependence,
+    interpreted as interpreted,
+    is_linear as is_linear,
+    signature as signature,
+)
 from .matching import (
     CoarseDecomposition as CoarseDecomposition,
     StructurallySingular as StructurallySingular,

@@ -11,13 +11,13 @@ surely as too few make it fail.
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..compiler import ALL_CALLS, called
 from . import (
@@ -58,6 +58,9 @@ RULES: Mapping[str, Rule] = {
     "unstack": entries.unstack,
 }
 
+# What becomes of the sets of inputs on which an entry depends with a derivative that is zero wherever it exists.
+Flat = Callable[[np.ndarray], np.ndarray]
+
 # Primitives whose rule runs inner jaxprs.
 CONTROL: Mapping[str, Callable[[Any, list[Cells], control.Run], list[Cells]]] = {
     "cond": control.cond,
@@ -91,13 +94,23 @@ def dependence(fn: Callable[..., Any], *example_args: Any, derivative: bool = Fa
 
     Raises `NotImplementedError` for a primitive without a rule, with its name.
     """
-    return interpreted(fn, *example_args, derivative=derivative)[0]
+    return interpreted(fn, *example_args, derivative=derivative).on
 
 
-def interpreted(
-    fn: Callable[..., Any], *example_args: Any, derivative: bool = False
-) -> tuple[list[np.ndarray], Float[np.ndarray, " outputs"]]:
-    """`dependence`, and the outputs that are numbers whatever the arguments are, NaN where they are none."""
+class Interpretation(NamedTuple):
+    """What `dependence` gives, the part of it in which outputs `jump` (through comparisons, rounding, `sign`, integers, truth
+    values and `stop_gradient`), and the outputs that are `numbers` whatever the arguments are, NaN where they are none.
+    """
+
+    on: list[Bool[np.ndarray, "outputs inputs"]]
+    jumps: list[Bool[np.ndarray, "outputs inputs"]]
+    numbers: Float[np.ndarray, " outputs"]
+
+
+def interpreted(fn: Callable[..., Any], *example_args: Any, derivative: bool = False) -> Interpretation:
+    """All that is known of a function before it is evaluated; for the arguments see `dependence`. With `derivative` no
+    output jumps.
+    """
     leaves, treedef = jax.tree.flatten(example_args)
     avals = [_aval(leaf) for leaf in leaves]
     closed = jax.make_jaxpr(lambda *flat: fn(*jax.tree.unflatten(treedef, flat)))(*avals)
@@ -108,11 +121,29 @@ def interpreted(
         discrete = derivative and not jnp.issubdtype(aval.dtype, jnp.inexact)
         inputs.append(Cells.unknown(0 if discrete else bits, aval))
         start += size
-    outputs = _run(closed, inputs, derivative)
-    pattern = as_rows([bits for cells in outputs for bits in cells.dependence.reshape(-1)], start)
+    # What a set holds above the inputs are those through which it jumps.
+    inside = (1 << start) - 1
+    flat = (lambda sets: sets & 0) if derivative else (lambda sets: sets | (sets & inside) << start)
+    outputs = _run(closed, inputs, flat)
+    pattern = as_rows([bits for cells in outputs for bits in cells.dependence.reshape(-1)], 2 * start)
     ends = np.cumsum([sum(jax.tree.leaves(part)) for part in jax.tree.unflatten(treedef, sizes)])
+    on, jumps = (np.split(half, ends.astype(int)[:-1], axis=1) for half in (pattern[:, :start], pattern[:, start:]))
     numbers = [np.where(cells.known, cells.value, np.nan).reshape(-1) for cells in outputs]
-    return np.split(pattern, ends.astype(int)[:-1], axis=1), np.concatenate([np.zeros(0), *numbers])
+    return Interpretation(on, jumps, np.concatenate([np.zeros(0), *numbers]))
+
+
+def is_linear(fn: Callable[..., Any], *example_args: Any, argument: int) -> bool:
+    """Whether `fn` is linear in one of its arguments, an array: its slope there is the same everywhere, and it has no kinks
+    (`abs`, `max`, `where`) and no jumps (`sign`, `floor`, comparisons). Raises as `dependence` does.
+    """
+
+    def slope(along: Any, *args: Any) -> Any:
+        of = lambda x: fn(*args[:argument], x, *args[argument + 1 :])
+        return jax.jvp(of, (args[argument],), (along,))
+
+    found = interpreted(slope, example_args[argument], *example_args)
+    values = found.on[0].shape[0] // 2
+    return not (found.jumps[1 + argument].any() or found.on[1 + argument][values:].any())
 
 
 def signature(*patterns: np.ndarray) -> list[dict[int, int]]:
@@ -126,7 +157,7 @@ def signature(*patterns: np.ndarray) -> list[dict[int, int]]:
     return rows
 
 
-def _run(closed: ClosedJaxpr, inputs: Sequence[Cells], derivative: bool) -> list[Cells]:
+def _run(closed: ClosedJaxpr, inputs: Sequence[Cells], flat: Flat) -> list[Cells]:
     """The outputs of a jaxpr on `inputs`."""
     jaxpr = closed.jaxpr
     env: dict[Any, Cells] = dict(zip(jaxpr.invars, inputs, strict=True))
@@ -134,25 +165,25 @@ def _run(closed: ClosedJaxpr, inputs: Sequence[Cells], derivative: bool) -> list
         env[variable] = _constant(const, variable.aval)
     for eqn in jaxpr.eqns:
         if eqn.outvars:
-            outputs = _run_eqn(eqn, [_read(env, atom) for atom in eqn.invars], derivative)
+            outputs = _run_eqn(eqn, [_read(env, atom) for atom in eqn.invars], flat)
             env.update(zip(eqn.outvars, outputs, strict=True))
     return [_read(env, atom) for atom in jaxpr.outvars]
 
 
-def _run_eqn(eqn: Any, inputs: list[Cells], derivative: bool) -> list[Cells]:
+def _run_eqn(eqn: Any, inputs: list[Cells], flat: Flat) -> list[Cells]:
     """The outputs of one equation of a jaxpr: numbers where the operands are, else by its rule."""
     name = eqn.primitive.name
     if name not in _CHEAP and not eqn.effects and all(cells.known.all() for cells in inputs):
         numbers = evaluate(eqn, [cells.value for cells in inputs])
         return [_constant(number, out.aval) for number, out in zip(numbers, eqn.outvars, strict=True)]
-    run = functools.partial(_run, derivative=derivative)
+    run = functools.partial(_run, flat=flat)
     inner = called(eqn, CALLS)
     if inner is not None:
         outputs = run(inner, inputs)
     elif name in CONTROL:
         outputs = CONTROL[name](eqn, inputs, run)
     elif name == "sort":
-        outputs = contractions.sort(eqn, inputs, with_order=not derivative)
+        outputs = contractions.sort(eqn, inputs, flat)
     elif name in RULES:
         outputs = RULES[name](eqn, inputs)
     else:
@@ -163,15 +194,13 @@ def _run_eqn(eqn: Any, inputs: list[Cells], derivative: bool) -> list[Cells]:
     for cells, out in zip(outputs, eqn.outvars, strict=True):
         if cells.shape != out.aval.shape:
             raise AssertionError(f"The rule of `{name}` gave shape {cells.shape}, not {out.aval.shape}.")
-    if derivative:
-        return [_smooth(cells, out.aval, name) for cells, out in zip(outputs, eqn.outvars, strict=True)]
-    return outputs
+    return [_flattened(cells, out.aval, name, flat) for cells, out in zip(outputs, eqn.outvars, strict=True)]
 
 
-def _smooth(cells: Cells, aval: Any, name: str) -> Cells:
-    """Without the dependences whose derivative is zero."""
+def _flattened(cells: Cells, aval: Any, name: str, flat: Flat) -> Cells:
+    """With the dependences whose derivative is zero as `flat` has them."""
     if name in entries.FLAT or not jnp.issubdtype(aval.dtype, jnp.inexact):
-        return Cells(np.zeros(cells.shape, object), cells.known, cells.value)
+        return Cells(flat(cells.dependence), cells.known, cells.value)
     return cells
 
 

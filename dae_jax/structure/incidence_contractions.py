@@ -1,5 +1,6 @@
 """Dependence rules of primitives in which an entry comes from many: sums, products of matrices, linear algebra."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
@@ -167,15 +168,14 @@ def triangular_solve(eqn: Any, inputs: list[Cells]) -> list[Cells]:
     return [result if p["left_side"] else result.map(lambda x: x.swapaxes(-1, -2))]
 
 
-def sort(eqn: Any, inputs: list[Cells], with_order: bool) -> list[Cells]:
-    """Operands put in the order of their keys: every entry along the axis may end up anywhere.
-
-    `with_order`: whether a result also depends on the keys that order it.
+def sort(eqn: Any, inputs: list[Cells], flat: Callable[[np.ndarray], np.ndarray]) -> list[Cells]:
+    """Operands put in the order of their keys, on which they depend by jumps, `flat`: every entry along the axis may end up
+    anywhere.
     """
     axis, keys = eqn.params["dimension"], inputs[: eqn.params["num_keys"]]
     order = np.zeros((), object)
-    for key in keys if with_order else []:
-        order = order | key.dependence
+    for key in keys:
+        order = order | flat(key.dependence)
     return [
         Cells.unknown(union(cells.dependence | order, (axis,), keepdims=True), out.aval)
         for cells, out in zip(inputs, eqn.outvars, strict=True)
