@@ -31,7 +31,8 @@ def table(cells):
     for cell in cells:
         x, y = methods.index(cell.method), place[cell.family, cell.stressor]
         undue = cell.ended != "answer" and cell.verdict in ("refused", "failed")
-        colour = SILENT if undue else WRONG if cell.verdict == "WRONG" else GOOD if cell.lost == 0 else colours(norm(cell.lost))
+        colour = GOOD if cell.lost == 0 else colours(norm(cell.lost))
+        colour = WRONG if cell.verdict == "WRONG" else SILENT if undue else colour
         axes.add_patch(_square(x, y, colour))
         marker = "x" if cell.verdict == "WRONG" else {"refused": "s", "failed": "^"}.get(cell.ended)
         if marker:

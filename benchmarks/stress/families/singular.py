@@ -1,9 +1,9 @@
 """Configurations at and near a singularity of the constraints.
 
 A slider-crank whose rod is longer than its crank by δ, in θ and s, 0 = s² − 2 s sin θ − η with η = 2δ + δ²: at θ = 0 the slider turns
-within √η rad. At δ = 0 two motions cross there, the smooth one and the limit of small δ: each is a solution, and words are as good. A
-parallelogram passes its change point; two rods are pulled apart
-until they are straight, after which there is no state: a failure at that time is due.
+within √η rad, which fixed steps do not see below 1e-6, and a drift of more than η makes another mechanism of it. At δ = 0 two
+motions cross there, the smooth one and the limit of small δ: each is a solution, and words are as good. A parallelogram passes its
+change point; two rods are pulled apart until they are straight, after which there is no state: a failure at that time is due.
 """
 
 import itertools
@@ -17,11 +17,12 @@ import dae_jax as dj
 
 from ..cases import Case
 from . import pendulum
+from .scales import with_tolerance
 
 
 def no_force(t, q, v, args):
     """Inertia alone."""
-    return 0 * v
+    return 0 * q
 
 
 def closing(t, q, args):
@@ -38,7 +39,7 @@ def chart(t, z, args):
 SLIDER = dj.ConstrainedSystem(no_force, closing)
 
 
-def dead_centre(excess, angle=0.8, rate=-2.0):
+def dead_centre(excess, angle=0.8, rate=-2.0, **rest):
     """Passes θ = 0 with the slider turning within √(2δ) rad. With sin θ = √η sinh u all is smooth in u:
     s′(θ) = cos θ (1 + tanh u), and the energy (1 + s′²) θ̇²/2 gives t(u).
     """
@@ -63,7 +64,8 @@ def dead_centre(excess, angle=0.8, rate=-2.0):
 
     y0 = tuple(x[0] for x in truth([0.0]))
     return Case(
-        f"dead centre at {excess:g}", SLIDER, y0, 0.6, truth, {"eta": np.asarray(eta)}, (1.0, 4.0), rate=4.0, steps=4000, chart=chart
+        f"dead centre at {excess:g}", SLIDER, y0, 0.6, truth, {"eta": np.asarray(eta)}, (1.0, 4.0), rate=max(4.0, 1 / root), steps=4000,
+        chart=chart, **rest,
     )  # fmt: skip
 
 
@@ -134,7 +136,8 @@ def pulled_apart():
 def cases(quick):
     """From afar to the singularity itself."""
     return [
-        *(dead_centre(excess) for excess in (1e-1, 1e-3, 1e-6, 1e-9, 1e-12)),
+        *(dead_centre(excess) for excess in (1e-1, 1e-3, 1e-6)),
+        *(dead_centre(excess, only=with_tolerance()) for excess in (1e-9, 1e-12)),
         crossing("dead centre exactly", 0.8, -2.0, "any", or_else=dead_centre(1e-15).truth),
         crossing("from 1e-6 off the dead centre", 1e-6, 2.0, "any"),
         crossing("from the dead centre", 0.0, 2.0, "refusal"),
