@@ -31,7 +31,9 @@ def main(argv=None):
     parser.add_argument(
         "--quick", action="store_true", help="a smoke test: few methods and stressors, under two minutes"
     )
-    parser.add_argument("--limit", type=float, default=LIMIT, help=f"seconds for a cell; by default {LIMIT}")
+    parser.add_argument(
+        "--limit", type=float, default=LIMIT, help=f"seconds of processor time for a cell; by default {LIMIT}"
+    )
     parser.add_argument(
         "--out",
         type=Path,

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import queue
+import signal
 import subprocess
 import sys
 import threading
@@ -13,29 +14,31 @@ from .judge import Cell
 
 
 ROOT = Path(__file__).parents[2]
-# Seconds for a cell, compilation included, and for the worker to start.
-LIMIT, START = 120, 60
+# Seconds of processor time for a cell, compilation included; of time on the clock so many times that, and for the worker to start.
+LIMIT, PATIENCE, START = 120, 10, 60
 
 
-def run(
-    family: str, todo: list[tuple[str, str]], quick: bool, limit: float = LIMIT, start: float = START
-) -> Iterator[tuple[Cell, dict]]:
+def run(family: str, todo: list[tuple[str, str]], quick: bool, limit: float = LIMIT) -> Iterator[tuple[Cell, dict]]:
     """The cells (stressor, method) of one family, each with what grew over time; in the order given."""
     todo = list(todo)
     while todo:
-        with _worker(family, quick) as (say, lines):
-            first = True
+        with _worker(family, quick, limit) as (process, lines):
             while todo:
-                say(json.dumps(todo[0]))
+                with contextlib.suppress(BrokenPipeError):
+                    print(json.dumps(todo[0]), file=process.stdin, flush=True)
                 try:
-                    line = lines.get(timeout=limit + start * first)
+                    line = lines.get(timeout=PATIENCE * limit + START)
                 except queue.Empty:
                     line = None
-                first = False
                 stressor, method = todo.pop(0)
                 if not line:
-                    how = "no answer in {limit:g} s" if line is None else "the process ended (memory, or a crash)"
-                    yield _silent(family, stressor, method, how.format(limit=limit)), {}
+                    slow = line is None or process.wait() == -signal.SIGPROF
+                    how = (
+                        f"no answer in {limit:g} s of processor time"
+                        if slow
+                        else "the process ended (memory, or a crash)"
+                    )
+                    yield _silent(family, stressor, method, how), {}
                     break
                 found = json.loads(line)
                 series = found.pop("series")
@@ -48,9 +51,9 @@ def _silent(family: str, stressor: str, method: str, words: str) -> Cell:
 
 
 @contextlib.contextmanager
-def _worker(family: str, quick: bool):
+def _worker(family: str, quick: bool, limit: float):
     """A process that takes cells and gives lines, "" at its end."""
-    command = [sys.executable, "-m", "benchmarks.stress.worker", family, *["--quick"] * quick]
+    command = [sys.executable, "-m", "benchmarks.stress.worker", family, "--limit", str(limit), *["--quick"] * quick]
     with subprocess.Popen(
         command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
     ) as process:
@@ -61,14 +64,10 @@ def _worker(family: str, quick: bool):
                 lines.put(line)
             lines.put("")
 
-        def say(line):
-            with contextlib.suppress(BrokenPipeError):
-                print(line, file=process.stdin, flush=True)
-
         reader = threading.Thread(target=read)
         reader.start()
         try:
-            yield say, lines
+            yield process, lines
         finally:
             process.kill()
             reader.join()
