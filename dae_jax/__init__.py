@@ -2,7 +2,7 @@
 
 import importlib as _importlib
 import importlib.metadata as _metadata
-from typing import Any as _Any
+from typing import TYPE_CHECKING as _TYPE_CHECKING, Any as _Any
 
 from .analyse import Structure as Structure, analyse as analyse
 from .compiler import configure as configure
@@ -14,7 +14,7 @@ from .diagnostics import (
     energy as energy,
     multipliers as multipliers,
 )
-from .driver.resets import Jump as Jump
+from .driver.resets import Jump as Jump, Reset as Reset
 from .explain import (
     MechanicalPlan as MechanicalPlan,
     Plan as Plan,
@@ -58,6 +58,11 @@ from .systems import (
     SemiExplicitDAE as SemiExplicitDAE,
 )
 
+
+if _TYPE_CHECKING:
+    from . import compiler as compiler, scenes as scenes
+    from .app import plotting as plotting
+    from .studies import reductions as reductions
 
 _MODULES = {
     "compiler": ".compiler",

@@ -3,8 +3,6 @@
 The value of a `RESULTS` is read as `result._value` where it is needed: a number, or a tracer of one.
 """
 
-from typing import Any
-
 from diffrax._root_finder import use_stepsize_tol as use_stepsize_tol
 from equinox.internal import unvmap_any as unvmap_any, while_loop as while_loop
 from jax._src.core import trace_state_clean as trace_state_clean
@@ -14,6 +12,6 @@ from jax._src.core import trace_state_clean as trace_state_clean
 CALLBACK_LOG = "jax._src.callback"
 
 
-def messages(enumeration: Any) -> list[str]:
+def messages(enumeration: type) -> list[str]:
     """The messages of an equinox enumeration by number; what is written here is said."""
-    return enumeration._index_to_message
+    return getattr(enumeration, "_index_to_message")  # noqa: B009

@@ -15,6 +15,7 @@ from .equations.residual_form import ResidualForm
 from .equations.taylor import total_derivatives
 from .structure import Block, block_triangular, pantelides
 from .systems import System, is_mechanism
+from .types import Args, Flat, State, Time
 from .validate.states import counted, refuse_wrong_state
 from .validate.user_functions import refuse_wrong_functions
 
@@ -95,7 +96,7 @@ class Structure:
     def derivative(self, times: int) -> Callable[[Any, Float[Array, "orders n"]], Float[Array, " n"]]:
         """The k-th derivative of the `equations`, k = `times`, as a function of t and of (y, ẏ, …), one below the other."""
 
-        def along(t: Any, derivatives: Float[Array, "orders n"]) -> Float[Array, " n"]:
+        def along(t: Time, derivatives: Float[Array, "orders n"]) -> Float[Array, " n"]:
             t = jnp.asarray(t, derivatives.dtype)
             combination = self.offsets.combination
             count = times + 1 + combination.degree
@@ -169,7 +170,7 @@ class Structure:
         return (f"[{mark}]" if self.transversal[i] == j else f" {mark}").ljust(4)
 
 
-def analyse(system: System, t0: Any, y0: Any, args: Any = None) -> Structure:
+def analyse(system: System, t0: Time, y0: State, args: Args = None) -> Structure:
     """The structure of a system: index, offsets, degrees of freedom, hidden constraints.
 
     A `ConstrainedSystem` is read as its index-3 equations of first order in (q, v, λ). Which equation depends on which
@@ -209,7 +210,7 @@ def _differentiated(times: int) -> str:
     )
 
 
-def _regular(form: ResidualForm, found: Offsets, t: Any, y: Any) -> bool:
+def _regular(form: ResidualForm, found: Offsets, t: Time, y: Flat) -> bool:
     """Whether the system Jacobian has full rank at the state, for generic derivatives and multipliers."""
     for seed in range(3):
         slopes, values = _slopes_at(form, found, t, y, found.combination.degree, seed)
@@ -228,7 +229,7 @@ def _regular(form: ResidualForm, found: Offsets, t: Any, y: Any) -> bool:
 
 
 def _slopes_at(
-    form: ResidualForm, found: Offsets, t: Any, y: Any, degree: int, seed: int = 0
+    form: ResidualForm, found: Offsets, t: Time, y: Flat, degree: int, seed: int = 0
 ) -> tuple[Slopes, np.ndarray]:
     """`Slopes` and what they give at a state, for generic derivatives and multipliers."""
     rng = np.random.default_rng(seed)

@@ -6,7 +6,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .equations.constraint_jacobian import Rank, mass_solve
 from .equations.initial_rates import is_nonlinear, rates_of
@@ -17,6 +18,7 @@ from .equations.residual_form import ResidualForm
 from .equations.structural_ode import StructuralODE
 from .linalg import fixed_point, implicit_root, relative_change
 from .systems import ConstrainedSystem, System, is_mechanism
+from .types import Args, Phase, Scalar, State, Time
 from .validate.states import broadcast_to_state, refuse_wrong_state, with_rates
 from .validate.user_functions import refuse_wrong_functions
 
@@ -56,14 +58,14 @@ class Violation(eqx.Module):
         return "The initial state `y0` violates the constraints:\n" + "\n".join(lines)
 
 
-def violation(ode: MechanicalODE, t: Any, y: Any) -> Violation:
+def violation(ode: MechanicalODE, t: Time, y: Phase) -> Violation:
     """How far the flat state y = (q, v) is from the manifold."""
     q, v = y
     eps = jnp.finfo(q.dtype).eps
-    allowed, at_velocity = (eps**0.5 * (1 + jnp.max(jnp.abs(x))) for x in (q, v))
+    of_q, of_v = (eps**0.5 * (1 + jnp.max(jnp.abs(x))) for x in (q, v))
     # A mechanism of micrometres: what is more than a part of itself off is no round-off, whatever the unit.
-    allowed = jnp.minimum(allowed, jnp.maximum(eps**0.25 * jnp.max(jnp.abs(q)), 1e4 * eps))
-    return Violation(ode.invariants(t, y), ode.distances(t, y), (allowed, at_velocity))
+    of_q = jnp.minimum(of_q, jnp.maximum(eps**0.25 * jnp.max(jnp.abs(q)), 1e4 * eps))
+    return Violation(ode.invariants(t, y), ode.distances(t, y), (of_q, of_v))
 
 
 class Unsolved(eqx.Module):
@@ -87,7 +89,7 @@ class Unsolved(eqx.Module):
         return "The initial state `y0` violates the equations, whatever its derivatives:\n" + "\n".join(lines)
 
 
-def unsolved(system: System, t: Any, state: Any, args: Any) -> Unsolved:
+def unsolved(system: System, t: Time, state: State, args: Args) -> Unsolved:
     """What no derivatives of a state make vanish of the equations of a system that is no mechanism."""
     form = ResidualForm.of(system, t, state, args)
     y = form.encode(state)
@@ -105,13 +107,13 @@ def unsolved(system: System, t: Any, state: Any, args: Any) -> Unsolved:
     return Unsolved(linearised.residual(t, y, yd), jnp.finfo(y.dtype).eps ** 0.5 * terms, form.equations, several)
 
 
-def _left_over(ode: StructuralODE, t: Any, y: Float[Array, " N"]) -> Unsolved:
+def _left_over(ode: StructuralODE, t: Time, y: Float[Array, " N"]) -> Unsolved:
     terms = jnp.sum(jnp.abs(ode.normals(t, y)), 1) * (1 + jnp.max(jnp.abs(y)))
     return Unsolved(ode.violations(t, y), jnp.finfo(y.dtype).eps ** 0.5 * terms, ode.invariant_names)
 
 
 def look_at_start(
-    system: System, t: Any, state: Any, args: Any, rank: int | Rank | None, invertible: bool
+    system: System, t: Time, state: State, args: Args, rank: int | Rank | None, invertible: bool
 ) -> tuple[Int[Array, ""], Bool[Array, ""]]:
     """What is wrong with a start: 0 for nothing, 1: it is inconsistent, 2: the constraints have not the given rank (`None`:
     all are independent), 3: the masses, 4: several ẏ satisfy the equations; and whether nothing is wrong beyond doubt.
@@ -142,9 +144,17 @@ class End(eqx.Module):
 
 
 def look_at_end(
-    system: System, t0: Any, start: Any, args: Any, rank: int | Rank | None, invertible: bool, end: Any, keeps: Any,
-    tolerances: Any, residual: bool,
-) -> End:  # fmt: skip
+    system: System,
+    t0: Time,
+    start: State,
+    args: Args,
+    rank: int | Rank | None,
+    invertible: bool,
+    end: tuple[Scalar, State],
+    keeps: tuple[bool, bool],
+    tolerances: tuple[Time, Time],
+    residual: bool,
+) -> End:
     """The state (t, y) at the `end` of a solve."""
     yes = jnp.asarray(True)
     if not is_mechanism(system):
@@ -162,7 +172,14 @@ def look_at_end(
 
 
 def consistent_state(
-    system: System, t0: Any, y0: Any, args: Any = None, *, fixed: Any = None, rates: Any = None, yd0: Any = None
+    system: System,
+    t0: Time,
+    y0: State,
+    args: Args = None,
+    *,
+    fixed: State = None,
+    rates: State = None,
+    yd0: State = None,
 ) -> Any:
     """The nearest state that satisfies the equations and the hidden ones.
 
@@ -195,7 +212,7 @@ def consistent_state(
         found, fine, remains = _nearest_of_mechanism(system, t0, y0, args, masks)
     else:
         found, fine, remains = _nearest_of_any(system, t0, y0, args, masks, rates)
-    if not isinstance(fine, jax.core.Tracer) and not bool(fine):
+    if not isinstance(fine, Tracer) and not bool(fine):
         said, instead = "The initial state `y0` violates", "No consistent state was found near `y0`; left over are"
         raise ValueError(
             remains.message().replace(said, instead).replace(", whatever its derivatives", "")
@@ -204,16 +221,16 @@ def consistent_state(
     return found
 
 
-def _nearest_of_mechanism(system: ConstrainedSystem, t: Any, y0: Any, args: Any, masks: Any) -> Any:
+def _nearest_of_mechanism(system: ConstrainedSystem, t: Time, y0: State, args: Args, masks: State) -> Any:
     ode = MechanicalODE.of(system, t, y0, args)
     q, v = ode.encode(y0)
-    weights = tuple(jnp.where(mask, 0, 1).astype(q.dtype) for mask in ode.encode(masks))
-    y, fine, remains = _nearest(ode, jnp.asarray(t, q.dtype), (q, v), weights)
+    of_q, of_v = (jnp.where(mask, 0, 1).astype(q.dtype) for mask in ode.encode(masks))
+    y, fine, remains = _nearest(ode, jnp.asarray(t, q.dtype), (q, v), (of_q, of_v))
     return ode.decode(t, y), fine, remains
 
 
 @eqx.filter_jit
-def _nearest_of_any(system: System, t: Any, y0: Any, args: Any, masks: Any, rates: Any) -> Any:
+def _nearest_of_any(system: System, t: Time, y0: State, args: Args, masks: State, rates: State) -> Any:
     form = ResidualForm.of(system, t, y0, args)
     values = form.encode(y0)
     t = jnp.asarray(t, values.dtype)
@@ -226,11 +243,11 @@ def _nearest_of_any(system: System, t: Any, y0: Any, args: Any, masks: Any, rate
 
 
 @eqx.filter_jit
-def _nearest(ode: MechanicalODE, t: Any, y: Any, weights: Any) -> Any:
+def _nearest(ode: MechanicalODE, t: Time, y: Phase, weights: Phase) -> Any:
     params = (ode, t, y, weights)
 
-    def iterate(params: Any) -> Any:
-        def correct(x: Any) -> Any:
+    def iterate(params: PyTree) -> Any:
+        def correct(x: Float[Array, " 2n"]) -> Any:
             new = _improved(x, params)
             return new, relative_change(new - x, x)
 
@@ -243,7 +260,7 @@ def _nearest(ode: MechanicalODE, t: Any, y: Any, weights: Any) -> Any:
     return jax.tree.map(lambda z: jnp.where(found, z, jnp.nan), (q, v)), found, remains
 
 
-def _improved(x: Float[Array, " 2n"], params: Any) -> Float[Array, " 2n"]:
+def _improved(x: Float[Array, " 2n"], params: PyTree) -> Float[Array, " 2n"]:
     """A Gauss–Newton step towards the constrained minimum of the distance to the given state."""
     ode, t, (q0, v0), (wq, wv) = params
     q, v = jnp.split(x, 2)

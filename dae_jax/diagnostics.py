@@ -10,12 +10,15 @@ from typing import Any, NamedTuple, overload
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from .equations.constraint_jacobian import Rank
 from .equations.mechanical import MechanicalODE
 from .equations.residual_drift import EquationDrift, equation_drift
 from .solution import DAESolution, without_padding
-from .systems import ConstrainedSystem, System, is_mechanism
+from .systems import ConstrainedSystem, ImplicitDAE, SemiExplicitDAE, System, is_mechanism
+from .types import Args, State, Time
 from .validate.states import brief, refuse_wrong_state, refuse_wrong_system
 from .validate.user_functions import refuse_no_real_number, refuse_wrong_functions, returned
 
@@ -32,6 +35,14 @@ class Drift(NamedTuple):
         return tuple(self)
 
 
+@overload
+def drift(system: ConstrainedSystem, sol: DAESolution) -> Drift: ...
+
+
+@overload
+def drift(system: SemiExplicitDAE | ImplicitDAE, sol: DAESolution) -> EquationDrift: ...
+
+
 def drift(system: System, sol: DAESolution) -> Drift | EquationDrift:
     """How far each saved state is off the constraints, and off the hidden ones.
 
@@ -45,7 +56,7 @@ def drift(system: System, sol: DAESolution) -> Drift | EquationDrift:
     if not is_mechanism(system):
         return EquationDrift(_at_saved_times(system, sol, lambda t, y, args: equation_drift(system, t, y, args)))
 
-    def largest(t: Any, y: Any, args: Any) -> tuple[Any, Any]:
+    def largest(t: Time, y: State, args: Args) -> tuple[Any, Any]:
         ode = MechanicalODE.of(system, t, y, args)
         g, dg = ode.invariants(t, ode.encode(y))
         return jnp.max(jnp.abs(g), initial=0), jnp.max(jnp.abs(dg), initial=0)
@@ -62,7 +73,7 @@ def energy(system: ConstrainedSystem, sol: DAESolution) -> Float[Array, " times"
         raise ValueError("The energy needs `ConstrainedSystem(..., potential=lambda q, args: ...)`.")
     potential: Any = system.potential
 
-    def total(t: Any, y: Any, args: Any) -> Any:
+    def total(t: Time, y: State, args: Args) -> Any:
         call = "potential(q, args)"
         refuse_no_real_number(returned(call, potential, y[0], args), call)
         ode = MechanicalODE.of(system, t, y, args)
@@ -79,7 +90,9 @@ def multipliers(system: ConstrainedSystem, sol: DAESolution, /) -> Float[Array, 
 
 
 @overload
-def multipliers(system: ConstrainedSystem, t: Any, q: Any, v: Any, args: Any = None, /) -> Float[Array, " mp"]: ...
+def multipliers(
+    system: ConstrainedSystem, t: Time, q: State, v: State, args: Args = None, /
+) -> Float[Array, " mp"]: ...
 
 
 def multipliers(system: ConstrainedSystem, *at: Any) -> Any:
@@ -106,7 +119,7 @@ def multipliers(system: ConstrainedSystem, *at: Any) -> Any:
     state = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), (q, v))
     refuse_wrong_state(system, state)
     found = _multipliers(system, t, state, args[0] if args else None, system.rank)
-    if not isinstance(found, jax.core.Tracer) and bool(jnp.any(jnp.isnan(found))):
+    if not isinstance(found, Tracer) and bool(jnp.any(jnp.isnan(found))):
         raise ValueError(
             "`multipliers` finds none at this point: the force or a constraint is not a number, or the constraints depend on each "
             "other there; where they are redundant say how many are independent by `ConstrainedSystem(..., rank=...)`."
@@ -114,7 +127,9 @@ def multipliers(system: ConstrainedSystem, *at: Any) -> Any:
     return found
 
 
-def _multipliers(system: ConstrainedSystem, t: Any, y: Any, args: Any, rank: Any) -> Float[Array, " mp"]:
+def _multipliers(
+    system: ConstrainedSystem, t: Time, y: State, args: Args, rank: int | Rank | None
+) -> Float[Array, " mp"]:
     ode = MechanicalODE.of(system, t, y, args, rank)
     return ode.multipliers(t, ode.encode(y))
 
@@ -129,7 +144,7 @@ def _at_saved_times(system: System, sol: DAESolution, of: Callable[..., Any]) ->
             "parts take one, `dataclasses.replace(sol, ts=sol.ts[0], ys=sol.ys[0])`."
         )
 
-    def along(ts: Any, ys: Any, args: Any) -> Any:
+    def along(ts: Float[Array, "*batch times"], ys: State, args: Args) -> Any:
         if ts.ndim > 1:
             return eqx.filter_vmap(along)(ts, ys, args)
         _refuse_no_states(system, ts, ys, args)
@@ -138,7 +153,7 @@ def _at_saved_times(system: System, sol: DAESolution, of: Callable[..., Any]) ->
     return along(sol.ts, sol.ys, sol.args)
 
 
-def _refuse_no_states(system: System, ts: Any, ys: Any, args: Any) -> None:
+def _refuse_no_states(system: System, ts: Float[Array, "*batch times"], ys: State, args: Args) -> None:
     one = jax.tree.map(lambda y: jax.ShapeDtypeStruct(y.shape[1:], y.dtype), ys)
     try:
         refuse_wrong_state(system, one, "sol.ys")

@@ -5,9 +5,13 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
+from jax.extend.core import ClosedJaxpr
+from jaxtyping import Array, Float, PyTree
 
 from .compiler import Decision, decision, equations, one_kernel_enabled, without_checks
 from .driver.program import Solve
@@ -22,7 +26,8 @@ from .linalg.semidefinite import LOOPED, UNROLLED
 from .solution import precision_of
 from .solve import prepared
 from .solvers import takes_residuals
-from .systems import is_mechanism
+from .systems import ConstrainedSystem, System, is_mechanism
+from .types import Args, Controller, Flat, ProgressMeter, Solver, State, Time
 from .validate.states import counted
 
 
@@ -98,7 +103,7 @@ class MechanicalPlan(Plan):
         independent = self.constraints if self.independent is None else self.independent
         redundant = "" if independent == self.constraints else f", {independent} of them independent"
         jacobian = "dense, by forward-mode derivatives"
-        if self.colours is not None:
+        if self.nonzeros is not None and self.colours is not None:
             jacobian = f"{counted(self.nonzeros, 'nonzero')} from {counted(self.colours, 'directional derivative')}"
         return {
             "system": f"{counted(self.coordinates, 'coordinate')}, {counted(self.constraints, 'constraint')}{redundant}",
@@ -165,18 +170,18 @@ class ResidualPlan(Plan):
 
 
 def explain(
-    system: Any,
-    solver: diffrax.AbstractSolver,
-    t0: Any,
-    y0: Any,
-    args: Any = None,
+    system: System,
+    solver: Solver,
+    t0: Time,
+    y0: State,
+    args: Args = None,
     *,
     formulation: AbstractFormulation | None = None,
     saveat: diffrax.SaveAt = diffrax.SaveAt(t1=True),  # noqa: B008
-    stepsize_controller: diffrax.AbstractStepSizeController | None = None,
+    stepsize_controller: Controller | None = None,
     adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint(),  # noqa: B008
     event: diffrax.Event | None = None,
-    progress_meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter(),  # noqa: B008
+    progress_meter: ProgressMeter = diffrax.NoProgressMeter(),  # noqa: B008
 ) -> Plan:
     """How `daesolve` would solve this, with the same arguments; nothing is solved.
 
@@ -192,10 +197,10 @@ def explain(
         lambda x: jnp.asarray(x) if isinstance(x, np.ndarray | np.generic) else x, (solve, problem)
     )
     system, t0, y0, args = problem.start
-    traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((solve, problem)))
-    rank = problem.rank if traced else refuse_bad_start(*problem.start, solve.formulation.inverts_mass)
+    traced = any(isinstance(x, Tracer) for x in jax.tree.leaves((solve, problem)))
+    rank = problem.rank if traced else refuse_bad_start(system, t0, y0, args, solve.formulation.inverts_mass)
     solve.refuse_wrong_functions(problem)
-    precision = precision_of(t0.dtype, solve.controller)
+    precision = precision_of(jnp.result_type(t0), solve.controller)
     kernel, arrays = solve.kernel(dataclasses.replace(problem, rank=rank))
     starts = jax.tree.leaves(y0)
     jaxpr = jax.make_jaxpr(without_checks(kernel))(arrays)
@@ -205,7 +210,7 @@ def explain(
         y, linearised = solve.formulation.encode(system, t0, y0, args)
         return _of_residual(linearised, t0, y, method, precision, compiled)
     if solve.formulation.selects_states or not is_mechanism(system):
-        ode = StructuralODE.of(ResidualForm.of(system, t0, y0, args), t0.dtype)
+        ode = StructuralODE.of(ResidualForm.of(system, t0, y0, args), jnp.result_type(t0))
         y = jax.eval_shape(ode.encode, t0, y0)
         return StructuralPlan(
             method=method,
@@ -240,7 +245,7 @@ def explain(
     )
 
 
-def _compiled(solve: Solve, jaxpr: Any, starts: list[bool]) -> dict[str, Any]:
+def _compiled(solve: Solve, jaxpr: ClosedJaxpr, starts: list[bool]) -> dict[str, Any]:
     """Who compiles a solve's loop, and why; `starts`: which of its arguments a batch of starts has lanes of."""
     off = "off: derivatives through the loop, a progress meter, a switch, or no CPU"
     if not one_kernel_enabled() or jax.default_backend() != "cpu" or solve.derivative() == "any":
@@ -255,10 +260,11 @@ def _compiled(solve: Solve, jaxpr: Any, starts: list[bool]) -> dict[str, Any]:
 
 
 def _of_residual(
-    linearised: LinearisedResidual, t0: Any, y: Any, method: str, precision: str, compiled: dict[str, Any]
+    linearised: LinearisedResidual, t0: Time, y: Flat, method: str, precision: str, compiled: dict[str, Any]
 ) -> ResidualPlan:
     structure, n = linearised.structure, y.size
-    colours = tuple(n if c is None else len(c.seeds) for c in (structure.by_y, structure.by_rate))
+    by_y, by_rate = (n if c is None else len(c.seeds) for c in (structure.by_y, structure.by_rate))
+    colours = by_y, by_rate
     return ResidualPlan(
         method=method,
         precision=precision,
@@ -273,12 +279,12 @@ def _of_residual(
     )
 
 
-def _name(module: Any) -> str:
+def _name(module: eqx.Module) -> str:
     inner = getattr(module, "solver", None)
     return type(module).__name__ + (f"({_name(inner)})" if inner is not None else "")
 
 
-def _mass(system: Any, mass: Any) -> str:
+def _mass(system: ConstrainedSystem, mass: Float[Array, "..."] | None) -> str:
     kind = "unit masses" if mass is None else "diagonal masses" if mass.ndim < 2 else "a full mass matrix"
     return kind + (" that depend on q" if callable(system.mass) else "")
 
@@ -307,7 +313,7 @@ def _left_out(ode: MechanicalODE, solve: Solve) -> Iterator[str]:
         yield "dense output"
 
 
-def _operations(fn: Callable[..., Any], *args: Any) -> int:
+def _operations(fn: Callable[..., Any], *args: PyTree) -> int:
     """How many primitive operations a function has, those that only move data left out."""
     moved = {
         "reshape",

@@ -8,9 +8,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Real
+from jaxtyping import Array, Float, Real
 
 from ._compat import messages
+from .types import DType, State, Time
 
 
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
@@ -84,7 +85,7 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "it), or another method."
     )
     too_many_jumps = (
-        "There were more jumps than `Jump(most=...)` allows: raise it, or look whether the jumps pile up at one time, as "
+        "There were more resets than `Reset(max_resets=...)` allows: raise it, or look whether they pile up at one time, as "
         "those of a ball that comes to rest do."
     )
 
@@ -100,7 +101,7 @@ class Interpolation(eqx.Module):
     decode: Callable[..., Any]
     ode: Any
 
-    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Any:
+    def evaluate(self, t0: Time, t1: Time | None = None, left: bool = True) -> Any:
         """The state at `t0`, or its increment from `t0` to `t1`."""
         if t1 is not None:
             return jax.tree.map(lambda a, b: b - a, self.evaluate(t0, left=left), self.evaluate(t1, left=left))
@@ -145,14 +146,14 @@ class DAESolution(eqx.Module):
             raise ValueError("The solution has no saved states; pass `saveat=diffrax.SaveAt(t1=True)`.")
         return jax.tree.map(_last, self.ts, self.ys)
 
-    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Any:
+    def evaluate(self, t0: Time, t1: Time | None = None, left: bool = True) -> Any:
         """The state at any time, where `SaveAt(dense=True)` was asked for."""
         if self.interpolation is None:
             raise ValueError("The solution has no dense output; pass `saveat=diffrax.SaveAt(dense=True)`.")
         return self.interpolation.evaluate(t0, t1, left)
 
 
-def precision_of(dtype: Any, controller: Any) -> str:
+def precision_of(dtype: DType, controller: diffrax.AbstractStepSizeController) -> str:
     """With how many digits a solve computes and what it allows for an error, in words."""
     if not isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
         return f"{np.dtype(dtype)}, fixed steps"
@@ -161,13 +162,13 @@ def precision_of(dtype: Any, controller: Any) -> str:
     return ", ".join([str(np.dtype(dtype)), *said])
 
 
-def _last(ts: Any, ys: Any) -> Any:
+def _last(ts: Float[Array, "*batch times"], ys: State) -> Any:
     if ts.ndim > 1:
         return jax.vmap(_last)(ts, ys)
     return jax.tree.map(lambda y: y[-1], without_padding(ts, ys)[1])
 
 
-def without_padding(ts: Any, ys: Any) -> tuple[Any, Any]:
+def without_padding(ts: Float[Array, "*batch times"], ys: State) -> tuple[Any, Any]:
     """Saved times and states with padding, times that are infinite, overwritten by the last ones that were saved: every
     function of them then has its value there, and its largest and smallest are those over the saved times.
     """
@@ -176,7 +177,7 @@ def without_padding(ts: Any, ys: Any) -> tuple[Any, Any]:
     return ts[at], jax.tree.map(lambda y: y[at], ys)
 
 
-def all_finite(ts: Any, ys: Any) -> Any:
+def all_finite(ts: Float[Array, "*batch times"], ys: State) -> Any:
     """Whether every saved state is finite; times that are not finite are padding."""
     saved = jnp.isfinite(ts)
     finite = [

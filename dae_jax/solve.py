@@ -2,19 +2,21 @@
 
 import dataclasses
 import functools
-from typing import Any
 
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
+from .compiler.types import Arrays
 from .driver.failures import OKAY, in_words, raised_in_the_program
 from .driver.options import refuse_misfits, refuse_no_event, refuse_other_steps, refuse_wrong_options
 from .driver.problem import Problem, Program, split
 from .driver.program import KEPT, Solve, run
-from .driver.resets import Jump, refuse_other_outputs
+from .driver.resets import Reset, refuse_other_outputs
 from .driver.start import as_array, checked, refuse_bad_start, refuse_bad_times
+from .equations.residual_form import Form
 from .formulations import (
     AbstractFormulation,
     Differentiation,
@@ -24,8 +26,9 @@ from .formulations import (
     why_not_as_written,
 )
 from .solution import DAESolution
-from .solvers import SelectedResiduals, SelectedStates, takes_residuals
+from .solvers import AbstractResidualSolver, SelectedResiduals, SelectedStates, takes_residuals
 from .systems import System, is_mechanism
+from .types import Args, Controller, DType, ProgressMeter, Solver, State, Time
 from .validate.states import with_rates
 from .validate.user_functions import not_finite, refuse_wrong_functions
 
@@ -35,22 +38,22 @@ _of_known_rank: dict[Program, Program] = {}
 
 def daesolve(
     system: System,
-    solver: diffrax.AbstractSolver,
-    t0: Any,
-    t1: Any,
-    dt0: Any,
-    y0: Any,
-    args: Any = None,
+    solver: Solver,
+    t0: Time,
+    t1: Time,
+    dt0: Time | None,
+    y0: State,
+    args: Args = None,
     *,
-    yd0: Any = None,
+    yd0: State = None,
     formulation: AbstractFormulation | None = None,
     saveat: diffrax.SaveAt = diffrax.SaveAt(t1=True),  # noqa: B008
-    stepsize_controller: diffrax.AbstractStepSizeController | None = None,
+    stepsize_controller: Controller | None = None,
     adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint(),  # noqa: B008
-    event: diffrax.Event | Jump | None = None,
+    event: diffrax.Event | Reset | None = None,
     max_steps: int | None = 4096,
     throw: bool = True,
-    progress_meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter(),  # noqa: B008
+    progress_meter: ProgressMeter = diffrax.NoProgressMeter(),  # noqa: B008
 ) -> DAESolution:
     """Solves a differential-algebraic equation. Mirrors `diffrax.diffeqsolve`.
 
@@ -69,8 +72,8 @@ def daesolve(
     - `stepsize_controller`: by default fixed steps if `dt0` is given, else `PIDController(rtol=1e-8, atol=1e-8)` (1e-5 in
       float32).
     - `saveat`, `adjoint`, `event`, `max_steps`, `throw`, `progress_meter`: as in diffrax. Functions in `saveat` and
-      `event` get the state in the structure of `y0`, and the user's `args`. With a `Jump` as `event` the solve goes on
-      after it. Second derivatives are there in any order of modes, third ones with `jax.jacfwd` outside; with a `Jump`,
+      `event` get the state in the structure of `y0`, and the user's `args`. With a `Reset` as `event` the solve goes on
+      after it. Second derivatives are there in any order of modes, third ones with `jax.jacfwd` outside; with a `Reset`,
       a progress meter or without one kernel forward-mode derivatives need `adjoint=diffrax.ForwardMode()`.
 
     **Returns** a `DAESolution`.
@@ -83,7 +86,7 @@ def daesolve(
         max_steps, progress_meter,
     )  # fmt: skip
     program, arrays = split((solve, problem))
-    if any(isinstance(x, jax.core.Tracer) for x in arrays):
+    if any(isinstance(x, Tracer) for x in arrays):
         sol, *_ = run(program, arrays)
     else:
         sol = _run_on_numbers(program, arrays, solve, problem)
@@ -91,9 +94,21 @@ def daesolve(
 
 
 def prepared(
-    system: Any, solver: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, formulation: Any, saveat: Any,
-    stepsize_controller: Any, adjoint: Any, event: Any, max_steps: Any, progress_meter: Any,
-) -> tuple[Solve, Problem]:  # fmt: skip
+    system: System,
+    solver: Solver,
+    t0: Time,
+    t1: Time,
+    dt0: Time | None,
+    y0: State,
+    args: Args,
+    formulation: AbstractFormulation | None,
+    saveat: diffrax.SaveAt,
+    stepsize_controller: Controller | None,
+    adjoint: diffrax.AbstractAdjoint,
+    event: diffrax.Event | Reset | None,
+    max_steps: int | None,
+    progress_meter: ProgressMeter,
+) -> tuple[Solve, Problem]:
     """The method and the problem of a solve, checked, with the defaults filled in."""
     y0, args = checked(system, t0, t1, dt0, y0, args)
     refuse_wrong_options(saveat, stepsize_controller, adjoint, event, max_steps, progress_meter)
@@ -103,7 +118,7 @@ def prepared(
         formulation = Differentiation()
     refuse_misfits(formulation, solver)
     refuse_other_steps(solver, stepsize_controller, dt0)
-    if isinstance(formulation, Residual) and formulation.variable_index is None:
+    if isinstance(formulation, Residual) and formulation.variable_index is None and takes_residuals(solver):
         why_not = _why_not_as_written(system, t0, y0, args, formulation, solver.highest_index)
         if why_not:
             raise ValueError(
@@ -118,17 +133,19 @@ def prepared(
     dtype = jnp.result_type(*jax.tree.leaves(y0))
     if stepsize_controller is None:
         stepsize_controller = _default_controller(dt0, dtype)
-    t0, t1, dt0 = (x if x is None else as_array(x, dtype) for x in (t0, t1, dt0))
+    start, end, step = as_array(t0, dtype), as_array(t1, dtype), None if dt0 is None else as_array(dt0, dtype)
     saveat = jax.tree.map(lambda x: as_array(x, dtype) if isinstance(x, np.ndarray | jax.Array) else x, saveat)
     if event is not None:
         refuse_no_event(solver)
-    if isinstance(event, Jump):
+    if isinstance(event, Reset):
         refuse_other_outputs(saveat)
     solve = Solve(formulation, solver, saveat, stepsize_controller, adjoint, event, max_steps, progress_meter)
-    return solve, Problem(system, t0, t1, dt0, y0, args, getattr(system, "rank", None))
+    return solve, Problem(system, start, end, step, y0, args, getattr(system, "rank", None))
 
 
-def _for_residuals(system: Any, t0: Any, y0: Any, args: Any, solver: Any) -> AbstractFormulation:
+def _for_residuals(
+    system: System, t0: Time, y0: State, args: Args, solver: AbstractResidualSolver
+) -> AbstractFormulation:
     """The equations as they are written where the solver controls all their variables."""
     if is_mechanism(system):
         return Residual()
@@ -136,26 +153,26 @@ def _for_residuals(system: Any, t0: Any, y0: Any, args: Any, solver: Any) -> Abs
     return DummyDerivatives() if reason else Residual()
 
 
-def _why_not_as_written(system: Any, t0: Any, y0: Any, args: Any, formulation: Residual, highest: int) -> str:
+def _why_not_as_written(system: System, t0: Time, y0: State, args: Args, formulation: Residual, highest: int) -> str:
     program, arrays = split((system, t0, y0, args))
     shapes = tuple(jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)) for x in arrays)
     return _found_of_structure(program, shapes, formulation.form, highest)
 
 
 @functools.lru_cache(maxsize=256)
-def _found_of_structure(program: Program, shapes: tuple[Any, ...], form: Any, highest: int) -> str:
+def _found_of_structure(program: Program, shapes: tuple[jax.ShapeDtypeStruct, ...], form: Form, highest: int) -> str:
     found = []
 
-    def look(arrays: Any) -> None:
-        inputs = program.whole(arrays)
-        refuse_wrong_functions(*inputs)
-        found.append(why_not_as_written(*inputs, form, highest))
+    def look(arrays: Arrays) -> None:
+        system, t0, y0, args = program.whole(arrays)
+        refuse_wrong_functions(system, t0, y0, args)
+        found.append(why_not_as_written(system, t0, y0, args, form, highest))
 
     jax.eval_shape(look, list(shapes))
     return found[0]
 
 
-def _run_on_numbers(program: Program, arrays: list[Any], solve: Solve, problem: Problem) -> DAESolution:
+def _run_on_numbers(program: Program, arrays: Arrays, solve: Solve, problem: Problem) -> DAESolution:
     """`run`, refusing an inconsistent start in words. How many constraints are independent is found, and remembered, where it
     is not all of them.
     """
@@ -165,7 +182,7 @@ def _run_on_numbers(program: Program, arrays: list[Any], solve: Solve, problem: 
         known = _with_rank(program, solve, problem) if solve.formulation.counts_constraints else program
     sol, as_expected, seconds = run(known, arrays)
     # Inside an outer `jit` the result is no number, although the inputs are: they are looked at each time it is traced.
-    inside = isinstance(as_expected, jax.core.Tracer)
+    inside = isinstance(as_expected, Tracer)
     if inside or not as_expected:
         better = _with_rank(program, solve, problem)
         if better != known:
@@ -187,7 +204,7 @@ def _with_rank(program: Program, solve: Solve, problem: Problem) -> Program:
     return better
 
 
-def _default_controller(dt0: Any, dtype: Any) -> Any:
+def _default_controller(dt0: Time | None, dtype: DType) -> diffrax.AbstractStepSizeController:
     if dt0 is not None:
         return diffrax.ConstantStepSize()
     return _PID64 if dtype == jnp.float64 else _PID32
@@ -197,7 +214,7 @@ _PID64, _PID32 = (diffrax.PIDController(rtol=tolerance, atol=tolerance) for tole
 
 
 def _raise_if_failed(sol: DAESolution, problem: Problem) -> DAESolution:
-    if isinstance(sol.result._value, jax.core.Tracer):
+    if isinstance(sol.result._value, Tracer):
         return raised_in_the_program(sol)
     if int(sol.result._value) in OKAY:
         return sol

@@ -2,13 +2,16 @@
 
 import abc
 from collections.abc import Callable
-from typing import Any, ClassVar, Literal, NamedTuple, TypeGuard
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from typing_extensions import TypeIs
+
+from .types import Args, State, Time
 
 
 class Call(NamedTuple):
@@ -33,7 +36,7 @@ class AbstractSystem(eqx.Module):
     pair: ClassVar[str] = ""
 
     @abc.abstractmethod
-    def calls(self, t: Any, state: Any, args: Any) -> list[Call]:
+    def calls(self, t: Time, state: State, args: Args) -> list[Call]:
         """How the user's functions are called."""
 
 
@@ -92,7 +95,7 @@ class ConstrainedSystem(AbstractSystem):
                 f"of all), or None for all of them, but is {self.rank!r}."
             )
 
-    def calls(self, t: Any, state: Any, args: Any) -> list[Call]:
+    def calls(self, t: Time, state: State, args: Args) -> list[Call]:
         q, v = state
         found = [Call("force(t, q, v, args)", self.force, (t, q, v, args), "structure", q, "q")]
         if self.constraint is not None:
@@ -101,7 +104,7 @@ class ConstrainedSystem(AbstractSystem):
             found.append(Call("nonholonomic(t, q, v, args)", self.nonholonomic, (t, q, v, args), "vector"))
         return found
 
-    def mass_matrix(self, q: Any, args: Any = None) -> Float[Array, "n n"] | Float[Array, " n"] | None:
+    def mass_matrix(self, q: State, args: Args = None) -> Float[Array, "n n"] | Float[Array, " n"] | None:
         """M at `q`: `None` for unit masses, a vector if diagonal, else a matrix."""
         mass = self.mass(q, args) if callable(self.mass) else self.mass
         if mass is None:
@@ -138,7 +141,7 @@ class SemiExplicitDAE(AbstractSystem):
     def __check_init__(self) -> None:
         _require_functions(self, "f", "g")
 
-    def calls(self, t: Any, state: Any, args: Any) -> list[Call]:
+    def calls(self, t: Time, state: State, args: Args) -> list[Call]:
         x, z = state
         return [
             Call("f(t, x, z, args)", self.f, (t, x, z, args), "structure", x, "x"),
@@ -166,7 +169,7 @@ class ImplicitDAE(AbstractSystem):
     def __check_init__(self) -> None:
         _require_functions(self, "residual")
 
-    def calls(self, t: Any, state: Any, args: Any) -> list[Call]:
+    def calls(self, t: Time, state: State, args: Args) -> list[Call]:
         rates = jax.tree.map(lambda x: np.zeros(jnp.shape(x), jnp.result_type(x)), state)
         return [Call("residual(t, y, yd, args)", self.residual, (t, state, rates, args), "count", state, "y")]
 
@@ -174,12 +177,12 @@ class ImplicitDAE(AbstractSystem):
 System = ConstrainedSystem | SemiExplicitDAE | ImplicitDAE
 
 
-def is_mechanism(system: Any) -> TypeGuard[ConstrainedSystem]:
+def is_mechanism(system: System) -> TypeIs[ConstrainedSystem]:
     """Whether a system has masses, forces and constraints, from which its underlying ODE is found fastest."""
     return isinstance(system, ConstrainedSystem)
 
 
-def is_implicit(system: Any) -> TypeGuard[ImplicitDAE]:
+def is_implicit(system: System) -> TypeIs[ImplicitDAE]:
     """Whether ẏ may occur in the equations in any way."""
     return isinstance(system, ImplicitDAE)
 

@@ -4,11 +4,12 @@ import dataclasses
 import sys
 import time
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, cast
 
 import diffrax
 import jax
 import numpy as np
+from jax import Array
 
 from ..diagnostics import drift, energy
 from ..formulations import AbstractFormulation, Baumgarte, DummyDerivatives, Residual, StateSpace
@@ -112,12 +113,11 @@ def solve(scene: Scene, method: Method, times: np.ndarray, rtol: float, step: fl
     """The scene by one method at the given times. The tolerance, and `step` in place of the method's, are numbers of the
     compiled program, not parts of it: another one compiles nothing.
     """
-    tolerances = {name: np.asarray(size) for name, size in (("rtol", rtol), ("atol", scene.scale * rtol))}
-    controller = None if method.step else diffrax.PIDController(**tolerances)
+    controller = diffrax.PIDController(rtol=np.asarray(rtol), atol=np.asarray(scene.scale * rtol))
     return daesolve(
         scene.system, method.solver, 0.0, times[-1], step or method.step, scene.y0, scene.args,
-        formulation=method.formulation, stepsize_controller=controller,
-        saveat=diffrax.SaveAt(ts=times), max_steps=10_000_000,
+        formulation=method.formulation, stepsize_controller=None if method.step else controller,
+        saveat=diffrax.SaveAt(ts=cast(Array, times)), max_steps=10_000_000,
     )  # fmt: skip
 
 

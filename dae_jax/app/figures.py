@@ -15,6 +15,7 @@ import numpy as np
 from ..diagnostics import drift, energy
 from ..formulations import Baumgarte, StateSpace
 from ..scenes import Scene
+from ..solution import DAESolution
 from ..solvers import DOP853, OrthogonalProjection, SymmetricProjection, Trapezoid
 from ..systems import ConstrainedSystem, is_mechanism
 from . import plotting
@@ -31,10 +32,12 @@ def write_data(
         with written[-1].open("w", newline="") as file:
             table = csv.DictWriter(file, [field.name for field in dataclasses.fields(kind)])
             table.writeheader()
-            table.writerows(map(dataclasses.asdict, records))
+            table.writerows([dataclasses.asdict(record) for record in records])
     written.append(folder / "solutions.npz")
-    parts = {f"{name}_{letter}": x for name, sol in solutions.items() for letter, x in _parts(scene, sol)}
-    times = {f"{name}_t": np.asarray(sol.ts) for name, sol in solutions.items()}
+    parts: dict[str, Any] = {
+        f"{name}_{letter}": x for name, sol in solutions.items() for letter, x in _parts(scene, sol)
+    }
+    times: dict[str, Any] = {f"{name}_t": np.asarray(sol.ts) for name, sol in solutions.items()}
     np.savez(written[-1], **parts, **times)
     return written
 
@@ -101,7 +104,7 @@ def _drift(scene: Scene, solutions: dict[str, Any], level: str, violated: str) -
     return plotting.drift(curves, f"{scene.name}: drift off the constraints", violated=violated)
 
 
-def _mechanism(scene: Scene, method: str, sol: Any) -> Any:
+def _mechanism(scene: Scene, method: str, sol: DAESolution) -> Any:
     drawing = scene.drawing
     assert drawing is not None
     times = np.asarray(sol.ts)
@@ -114,7 +117,7 @@ def _mechanism(scene: Scene, method: str, sol: Any) -> Any:
     )  # fmt: skip
 
 
-def _components(scene: Scene, name: str, sol: Any) -> Any:
+def _components(scene: Scene, name: str, sol: DAESolution) -> Any:
     times = np.asarray(sol.ts)
     curves = {}
     for letter, part in _parts(scene, sol):
@@ -124,7 +127,7 @@ def _components(scene: Scene, name: str, sol: Any) -> Any:
     return plotting.over_time(curves, "value / largest value", f"{scene.name} by {name}", log_time=decades)
 
 
-def _parts(scene: Scene, sol: Any) -> list[tuple[str, np.ndarray]]:
+def _parts(scene: Scene, sol: DAESolution) -> list[tuple[str, np.ndarray]]:
     """The leaves of a solution, by the letters of the documentation."""
     system = scene.system
     letters = "".join(system.parts)
@@ -134,7 +137,7 @@ def _parts(scene: Scene, sol: Any) -> list[tuple[str, np.ndarray]]:
 # The paper's figures: of a scene, at a tolerance
 
 
-def _drift_off(scene: Scene, rtol: float) -> Any:
+def _drift_off(scene: Scene[ConstrainedSystem], rtol: float) -> Any:
     times = np.linspace(0, 100, 1001)
     curves = {}
     for h in (0.05, 0.02, 0.01):
@@ -173,6 +176,7 @@ def _path_by_baumgarte(scene: Scene, rtol: float) -> Any:
 
 
 def _path_in_state_space(scene: Scene, rtol: float) -> Any:
+    assert scene.chart is not None
     return _path(scene, Method(DOP853(), StateSpace(scene.chart)), rtol, "State-space form")
 
 

@@ -2,12 +2,13 @@
 
 import functools
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from ..scenes import Scene
 from ..solution import RESULTS
@@ -17,6 +18,7 @@ from ..studies.baumgarte_loss import FAILED, BaumgarteLoss, Verification, baumga
 from ..studies.reductions import first_flip, lyapunov
 from ..studies.sweep import grid, sweep
 from ..studies.tune import descent
+from ..systems import ConstrainedSystem
 from . import plotting
 
 
@@ -35,7 +37,7 @@ class Point(NamedTuple):
     verification: Verification
 
 
-def loss_of(scene: Scene, t1: float, dt0: float) -> BaumgarteLoss:
+def loss_of(scene: Scene[ConstrainedSystem], t1: float, dt0: float) -> BaumgarteLoss:
     """The loss of Baumgarte's parameters for a mechanism, against the scene's own reference where that is known at every time."""
     known = all(np.isfinite(x).all() for x in jax.tree.leaves(scene.reference(np.linspace(0, t1, 3))))
     reference = scene.reference if known else None
@@ -56,7 +58,7 @@ def baumgarte_map(loss: BaumgarteLoss, points: int, store: Path | None, progress
 
 
 def angle_map(
-    scene: Scene, points: int, t1: float, rtol: float, store: Path | None, progress: bool = True
+    scene: Scene[ConstrainedSystem], points: int, t1: float, rtol: float, store: Path | None, progress: bool = True
 ) -> dict[str, np.ndarray]:
     """A scene with a chart in two angles, released at rest: the time of the first flip of any of its links, and the
     finite-time Lyapunov exponent.
@@ -78,7 +80,7 @@ def angle_map(
             t1,
             None,
             y0,
-            saveat=diffrax.SaveAt(ts=times),
+            saveat=diffrax.SaveAt(ts=cast(Array, times)),
             stepsize_controller=controller,
             throw=False,
         )
@@ -149,5 +151,6 @@ def _write(folder: Path, name: str, figure: Any, data: dict[str, Any]) -> list[P
     folder.mkdir(parents=True, exist_ok=True)
     picture, arrays = folder / f"{name}.png", folder / f"{name}.npz"
     figure.savefig(picture)
-    np.savez(arrays, **{key: np.asarray(x) for key, x in data.items()})
+    numbers: dict[str, Any] = {key: np.asarray(x) for key, x in data.items()}
+    np.savez(arrays, **numbers)
     return [picture, arrays]

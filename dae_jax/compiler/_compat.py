@@ -11,6 +11,13 @@ import numpy as np
 from jax._src import xla_bridge
 from jax.interpreters.partial_eval import dce_jaxpr as dce_jaxpr
 
+from .types import Aval, Equation
+
+
+def setting(name: str) -> bool:
+    """One of JAX's settings by its name, which type checkers do not know."""
+    return getattr(jax.config, name)
+
 
 def backends_are_initialised() -> bool:
     """Whether JAX has chosen its devices, so that flags of XLA come too late."""
@@ -25,7 +32,7 @@ def compilation_cache_folder() -> str | None:
     return folder
 
 
-def is_check(eqn: Any) -> bool:
+def is_check(eqn: Equation) -> bool:
     """Whether an equation is the call that raises in `equinox.error_if`."""
     if eqn.primitive.name != "pure_callback":
         return False
@@ -33,7 +40,7 @@ def is_check(eqn: Any) -> bool:
     return getattr(callback, "__module__", None) == "equinox._errors"
 
 
-def is_key(aval: Any) -> bool:
+def is_key(aval: Aval) -> bool:
     """Whether an array is one of random keys."""
     dtype = getattr(aval, "dtype", bool)
     return not isinstance(dtype, np.dtype | type) and jax.numpy.issubdtype(dtype, jax.dtypes.prng_key)
@@ -44,7 +51,7 @@ def key_functions(dtype: Any) -> Any:
     return dtype._impl
 
 
-def check_messages(eqn: Any) -> list[str] | None:
+def check_messages(eqn: Equation) -> list[str] | None:
     """The messages of such a call, one of which it raises, by its only operand; `None` where they are not found."""
     messages = inspect.getclosurevars(eqn.params["callback"].callback_func).nonlocals.get("msgs")
     return list(messages) if messages is not None and len(eqn.invars) == 1 else None

@@ -5,17 +5,18 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Array
 
 
 class Difference(AssertionError):
     """Two compilers give different numbers for the same function."""
 
 
-def checked(ours: Sequence[Any], theirs: Sequence[Any], units: int) -> list[Any]:
+def checked(ours: Sequence[Array], theirs: Sequence[Array], units: int) -> list[Any]:
     """`ours`, in a program that raises a `Difference` where they are not `theirs`."""
     shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in ours]
 
-    def compare(ours: Sequence[Any], theirs: Sequence[Any]) -> list[np.ndarray]:
+    def compare(ours: Sequence[Array], theirs: Sequence[Array]) -> list[np.ndarray]:
         pairs = [(np.asarray(x), np.asarray(y)) for x, y in zip(ours, theirs, strict=True)]
         for k, (x, y) in enumerate(pairs):
             refuse_difference(k, x, y, units)

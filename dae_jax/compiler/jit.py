@@ -8,7 +8,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer, eval_jaxpr
 from jax.extend.core import jaxpr_as_fun
+from jaxtyping import Array, PyTree
 
 from .inspection import Lowered
 from .jaxprs.checks import checks_apart
@@ -43,21 +45,26 @@ def jit(
 class Jitted:
     """A function that is compiled when it is called; see `jit`."""
 
-    def __init__(self, fn: Callable[..., Any], static_argnums: Any, static_argnames: Any) -> None:
+    def __init__(
+        self,
+        fn: Callable[..., Any],
+        static_argnums: int | Sequence[int] | None,
+        static_argnames: str | Sequence[str] | None,
+    ) -> None:
         functools.update_wrapper(self, fn, updated=())
         self._fn = fn
         self._statics = {"static_argnums": static_argnums, "static_argnames": static_argnames}
         self._compiled = jax.jit(self._like_fn(self._traced), **self._statics)
 
-    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+    def __call__(self, *args: PyTree, **kwargs: PyTree) -> Any:
         """What `fn` gives."""
         return self._compiled(*args, **kwargs)
 
-    def lower(self, *args: Any, **kwargs: Any) -> Lowered:
+    def lower(self, *args: PyTree, **kwargs: PyTree) -> Lowered:
         """How a call with these arguments is compiled; nothing is run."""
         found: list[Lowered] = []
 
-        def look(*args: Any, **kwargs: Any) -> None:
+        def look(*args: PyTree, **kwargs: PyTree) -> None:
             flat, arrays, _ = _of_arrays(self._fn, args, kwargs)
             jaxpr = jax.make_jaxpr(flat)(*arrays)
             try:
@@ -72,33 +79,35 @@ class Jitted:
         """`body` by the name of `fn` and with its signature, by which JAX finds static arguments."""
         return functools.wraps(self._fn)(lambda *args, **kwargs: body(*args, **kwargs))
 
-    def __get__(self, instance: Any, owner: Any = None) -> Any:
+    def __get__(self, instance: object, owner: object = None) -> Any:
         return self if instance is None else functools.partial(self, instance)
 
-    def _traced(self, *args: Any, **kwargs: Any) -> Any:
+    def _traced(self, *args: PyTree, **kwargs: PyTree) -> Any:
         if not one_kernel_enabled() or jax.default_backend() != "cpu":
             return self._fn(*args, **kwargs)
         flat, arrays, tree = _of_arrays(self._fn, args, kwargs)
         jaxpr = jax.make_jaxpr(flat)(*arrays)
         # Of what an outer transformation traces the kernel has derivatives and lanes too.
-        traced = [isinstance(x, jax.core.Tracer) for x in jaxpr.consts]
+        traced = [isinstance(x, Tracer) for x in jaxpr.consts]
         constants = [x for x, t in zip(jaxpr.consts, traced, strict=True) if t]
 
-        def closed(*xs: Any) -> Arrays:
+        def closed(*xs: Array) -> Arrays:
             given = iter(xs)
             consts = [next(given) if t else x for x, t in zip(jaxpr.consts, traced, strict=True)]
-            return jax.core.eval_jaxpr(jaxpr.jaxpr, consts, *given)
+            return eval_jaxpr(jaxpr.jaxpr, consts, *given)
 
         return jax.tree.unflatten(tree[0], _differentiable(closed)(*constants, *arrays))
 
 
-def _of_arrays(fn: Callable[..., Any], args: Any, kwargs: Any) -> tuple[Callable[..., Arrays], Arrays, list[Any]]:
+def _of_arrays(
+    fn: Callable[..., Any], args: tuple[PyTree, ...], kwargs: dict[str, PyTree]
+) -> tuple[Callable[..., Arrays], Arrays, list[Any]]:
     """`fn` as a function of the traced leaves of its arguments, these, and where the tree of its results will be."""
     leaves, treedef = jax.tree.flatten((args, kwargs))
-    traced = [isinstance(x, jax.core.Tracer) for x in leaves]
+    traced = [isinstance(x, Tracer) for x in leaves]
     tree: list[Any] = []
 
-    def flat(*arrays: Any) -> Arrays:
+    def flat(*arrays: Array) -> Arrays:
         given = iter(arrays)
         args, kwargs = jax.tree.unflatten(
             treedef, [next(given) if t else x for x, t in zip(leaves, traced, strict=True)]
@@ -109,7 +118,7 @@ def _of_arrays(fn: Callable[..., Any], args: Any, kwargs: Any) -> tuple[Callable
     return flat, [x for x, t in zip(leaves, traced, strict=True) if t], tree
 
 
-def _flattened(tree: Any) -> tuple[Arrays, list[Any]]:
+def _flattened(tree: PyTree) -> tuple[Arrays, list[Any]]:
     leaves, treedef = jax.tree.flatten(tree)
     return leaves, [treedef]
 
@@ -118,11 +127,11 @@ def _differentiable(fn: Callable[..., Arrays]) -> Callable[..., Arrays]:
     """`fn` as one kernel, with its derivatives."""
 
     @jax.custom_jvp
-    def call(*xs: Any) -> Arrays:
+    def call(*xs: Array) -> Arrays:
         return _kernel(fn)(*xs)
 
     @functools.partial(call.defjvp, symbolic_zeros=True)
-    def _(xs: Any, dxs: Any) -> Any:
+    def _(xs: Sequence[Array], dxs: Sequence[Array]) -> Any:
         out = call(*xs)
         moving = [not isinstance(dx, jax.custom_derivatives.SymbolicZero) for dx in dxs]
         known = list(filter(is_inexact, out))
@@ -136,7 +145,7 @@ def _differentiable(fn: Callable[..., Arrays]) -> Callable[..., Arrays]:
 def _kernel(fn: Callable[..., Arrays]) -> Callable[..., Arrays]:
     """`fn`, of arrays and lists of them, as one kernel; its checks raise when that is done."""
 
-    def call(*args: Any) -> Arrays:
+    def call(*args: PyTree) -> Arrays:
         leaves, treedef = jax.tree.flatten(args)
         # A kernel knows of no mesh; JAX would write down for each number that it lies on none.
         with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):

@@ -12,11 +12,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import batching, mlir
+from jaxtyping import Array, PyTree
 
 from . import fallbacks, lower, waiting, xla_kernel
-from ._compat import dce_jaxpr
+from ._compat import dce_jaxpr, setting
 from .check import checked
 from .jaxprs.expansions import expanded
 from .jaxprs.scalar_interpreter import Unsupported
@@ -78,11 +80,11 @@ def as_kernel(fn: Callable[..., Any]) -> Callable[..., Any]:
     """`fn` (pytrees of arrays to a pytree of arrays) as one kernel where it can be one; it has no derivative then."""
     known: dict[Any, Any] = {}
 
-    def traced(*args: Any) -> Any:
+    def traced(*args: PyTree) -> Any:
         leaves, treedef = jax.tree.flatten(args)
         shapes = tuple(jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)) for x in leaves)
         jaxpr, out = known.get((treedef, shapes)) or _traced(fn, jax.tree.unflatten(treedef, shapes))
-        if not any(isinstance(x, jax.core.Tracer) for x in jaxpr.consts):
+        if not any(isinstance(x, Tracer) for x in jaxpr.consts):
             known[treedef, shapes] = jaxpr, out
         results = called(jaxpr, leaves)
         return jax.tree.unflatten(out, jax.jit(jaxpr_as_fun(jaxpr))(*leaves) if results is None else results)
@@ -90,7 +92,7 @@ def as_kernel(fn: Callable[..., Any]) -> Callable[..., Any]:
     return traced
 
 
-def _traced(fn: Callable[..., Any], shapes: Any) -> tuple[ClosedJaxpr, Any]:
+def _traced(fn: Callable[..., Any], shapes: PyTree) -> tuple[ClosedJaxpr, Any]:
     """The jaxpr, and the tree of the results."""
     # A kernel knows of no mesh; JAX would write down for each number that it lies on none.
     with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
@@ -98,11 +100,11 @@ def _traced(fn: Callable[..., Any], shapes: Any) -> tuple[ClosedJaxpr, Any]:
         return checks_dropped(jaxpr), jax.tree.structure(out)
 
 
-def called(jaxpr: ClosedJaxpr, args: Sequence[Any]) -> list[Any] | None:
+def called(jaxpr: ClosedJaxpr, args: Sequence[Array]) -> list[Any] | None:
     """The results of a traced function as one kernel; `None` where it cannot be one."""
     outvars = jaxpr.jaxpr.outvars
     known = [v.aval.dtype != jax.dtypes.float0 for v in outvars]
-    if jaxpr.effects or any(isinstance(x, jax.core.Tracer) for x in jaxpr.consts):
+    if jaxpr.effects or any(isinstance(x, Tracer) for x in jaxpr.consts):
         return None
     try:
         kernel, used = _needed(jaxpr)
@@ -116,25 +118,25 @@ def called(jaxpr: ClosedJaxpr, args: Sequence[Any]) -> list[Any] | None:
     ]
 
 
-def _bind(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Sequence[Any]) -> list[Any]:
+def _bind(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Sequence[Array]) -> list[Any]:
     return kernel_p.bind(*args, jaxpr=jaxpr, lanes=lanes)
 
 
 @kernel_p.def_impl
-def _(*args: Any, **params: Any) -> Any:
+def _(*args: Array, **params: Any) -> Any:
     # JAX looks for what is not a number by calling a function without compiling it, again where that compiles.
-    if jax.config.jax_disable_jit or jax.config.jax_debug_nans or jax.config.jax_debug_infs:
+    if any(map(setting, ("jax_disable_jit", "jax_debug_nans", "jax_debug_infs"))):
         return _plain(*args, **params)
     return jax.jit(lambda *xs: kernel_p.bind(*xs, **params))(*args)
 
 
 @kernel_p.def_abstract_eval
-def _(*args: Any, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> Any:
+def _(*args: Array, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> Any:
     lead = next(((x.shape[0],) for x, b in zip(args, lanes or [False] * len(args), strict=True) if b), ())
     return [v.aval.update(shape=(*lead, *v.aval.shape)) for v in jaxpr.jaxpr.outvars]
 
 
-def _lower(*args: Any, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> list[Any]:
+def _lower(*args: Array, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> list[Any]:
     began = waiting.begin()
     try:
         return _lowered(args, jaxpr, lanes)
@@ -143,7 +145,7 @@ def _lower(*args: Any, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> list[Any]
             waiting.end()
 
 
-def _lowered(args: Any, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> list[Any]:
+def _lowered(args: Sequence[Array], jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> list[Any]:
     ours = _by_llvm(jaxpr, lanes, args)
     if ours is None:
         return _by_xla(jaxpr, lanes, args)
@@ -152,7 +154,7 @@ def _lowered(args: Any, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> list[Any
     return ours
 
 
-def _by_llvm(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Any) -> list[Any] | None:
+def _by_llvm(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Sequence[Array]) -> list[Any] | None:
     if _decided(jaxpr, lanes).compiler != "llvm":
         return None
     try:
@@ -165,7 +167,7 @@ def _by_llvm(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Any) -> list[Any
     return None
 
 
-def _by_xla(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Any) -> list[Any]:
+def _by_xla(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Sequence[Array]) -> list[Any]:
     if not lanes:
         return xla_kernel.compiled(jaxpr)(*args)
     axes = [0 if b else None for b in lanes]
@@ -176,15 +178,15 @@ def _by_xla(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Any) -> list[Any]
     return xla_kernel.compiled(jax.make_jaxpr(lambda *xs: _in_turn(jaxpr, lanes, xs))(*args))(*args)
 
 
-def _in_turn(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Any) -> list[Any]:
-    def one_lane(lane: Any) -> list[Any]:
+def _in_turn(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Sequence[Array]) -> list[Any]:
+    def one_lane(lane: Sequence[Array]) -> list[Any]:
         of_lane = iter(lane)
         return jaxpr_as_fun(jaxpr)(*(next(of_lane) if b else x for x, b in zip(args, lanes, strict=True)))
 
     return jax.lax.map(one_lane, tuple(x for x, b in zip(args, lanes, strict=True) if b))
 
 
-def _plain(*args: Any, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> list[Any]:
+def _plain(*args: Array, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> list[Any]:
     fn: Callable[..., list[Any]] = jaxpr_as_fun(jaxpr)
     return jax.vmap(fn, in_axes=[0 if b else None for b in lanes])(*args) if lanes else fn(*args)
 
@@ -193,9 +195,11 @@ mlir.register_lowering(kernel_p, mlir.lower_fun(_lower, multiple_results=True), 
 mlir.register_lowering(kernel_p, mlir.lower_fun(_plain, multiple_results=True))
 
 
-def _batch(args: Any, dims: Any, *, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> tuple[list[Any], list[Any]]:
+def _batch(
+    args: Sequence[Array], dims: Sequence[int | None], *, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]
+) -> tuple[list[Any], list[Any]]:
     batched = [d is not None for d in dims]
-    args = [jnp.moveaxis(x, d, 0) if b else x for x, d, b in zip(args, dims, batched, strict=True)]
+    args = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(args, dims, strict=True)]
     size = next(x.shape[0] for x, b in zip(args, batched, strict=True) if b)
     # `jacfwd` asks that a value which does not depend on the direction stays unbatched.
     differs = lower.varying(jaxpr, batched, in_memory=False)
@@ -212,7 +216,7 @@ def _batch(args: Any, dims: Any, *, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...])
     return [o if d else o[0] for o, d in zip(out, differs, strict=True)], [0 if d else None for d in differs]
 
 
-def _joined(x: Any, outer: int, inner: int, is_outer: bool, is_inner: bool) -> Any:
+def _joined(x: Array, outer: int, inner: int, is_outer: bool, is_inner: bool) -> Any:
     """Two batch axes as one."""
     if not (is_outer or is_inner):
         return x

@@ -12,13 +12,19 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
+from jax.typing import ArrayLike
+from jaxtyping import Array
 
 from .kernel_call import as_kernel
 
 
 Arrays = list[Any]
+
+# Which axis of each array is that of a batch.
+Axes = Sequence[int | None]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -34,13 +40,13 @@ class LinearMap:
     transposed: Callable[[], "LinearMap"]
     change: Callable[[], "LinearMap"]
 
-    def __call__(self, at: Sequence[Any], x: Sequence[Any], shapes: Sequence[Any]) -> Arrays:
+    def __call__(self, at: Sequence[Array], x: Sequence[Array], shapes: Sequence[Array | ShapedArray]) -> Arrays:
         """A(at) x, whose arrays have the shapes and types of these."""
-        avals = tuple(jax.core.ShapedArray(jnp.shape(s), jnp.result_type(s)) for s in shapes)
+        avals = tuple(ShapedArray(jnp.shape(s), jnp.result_type(s)) for s in shapes)
         return linear_p.bind(*at, *x, of=self, avals=avals)
 
 
-def is_inexact(x: Any) -> bool:
+def is_inexact(x: ArrayLike) -> bool:
     """Whether an array has derivatives."""
     return jnp.issubdtype(jnp.result_type(x), jnp.inexact)
 
@@ -48,7 +54,7 @@ def is_inexact(x: Any) -> bool:
 def moved(fn: Callable[[Arrays], Arrays], at: Arrays, changes: Arrays) -> Arrays:
     """How `fn(at)` changes with the inexact arrays in `at`."""
 
-    def of_inexact(*zs: Any) -> Arrays:
+    def of_inexact(*zs: Array) -> Arrays:
         rest = iter(zs)
         return fn([next(rest) if is_inexact(x) else x for x in at])
 
@@ -93,7 +99,7 @@ def derivative_map(
     n, count = len(moving), sum(moving)
 
     def of_moving(at: Arrays) -> tuple[Callable[..., Arrays], Arrays]:
-        def values(*zs: Any) -> Arrays:
+        def values(*zs: Array) -> Arrays:
             rest = iter(zs)
             return list(filter(is_inexact, fn([next(rest) if m else x for x, m in zip(at, moving, strict=True)])))
 
@@ -120,7 +126,7 @@ linear_p = Primitive("linear_map")
 linear_p.multiple_results = True
 
 
-def _evaluate(*args: Any, of: LinearMap, **_: Any) -> Arrays:
+def _evaluate(*args: Array, of: LinearMap, **_: object) -> Arrays:
     n = len(of.inexact)
     return of.apply(list(args[:n]), list(args[n:]))
 
@@ -130,7 +136,7 @@ linear_p.def_abstract_eval(lambda *_, avals, **__: list(avals))
 mlir.register_lowering(linear_p, mlir.lower_fun(_evaluate, multiple_results=True))
 
 
-def _jvp(primals: Any, tangents: Any, *, of: LinearMap, avals: Any) -> Any:
+def _jvp(primals: Arrays, tangents: Sequence[Array], *, of: LinearMap, avals: Sequence[ShapedArray]) -> Any:
     n = len(of.inexact)
     changes = [t for t, i in zip(tangents[:n], of.inexact, strict=True) if i]
     found = []
@@ -141,20 +147,20 @@ def _jvp(primals: Any, tangents: Any, *, of: LinearMap, avals: Any) -> Any:
     return of(primals[:n], primals[n:], avals), [functools.reduce(operator.add, xs) for xs in zip(*found, strict=True)]
 
 
-def _is_zero(tangent: Any) -> bool:
+def _is_zero(tangent: object) -> bool:
     return type(tangent) is ad.Zero
 
 
-def _instantiated(tangents: Sequence[Any]) -> Arrays:
+def _instantiated(tangents: Sequence[Array]) -> Arrays:
     return [jnp.zeros(t.aval.shape, t.aval.dtype) if _is_zero(t) else t for t in tangents]
 
 
-def _transpose(cotangents: Any, *args: Any, of: LinearMap, **_: Any) -> list[Any]:
+def _transpose(cotangents: Arrays, *args: Array, of: LinearMap, **_: object) -> list[Any]:
     n = len(of.inexact)
     return [None] * n + of.transposed()(args[:n], _instantiated(cotangents), [x.aval for x in args[n:]])
 
 
-def _batch(args: Any, axes: Any, *, of: LinearMap, avals: Any) -> Any:
+def _batch(args: Sequence[Array], axes: Axes, *, of: LinearMap, avals: Sequence[ShapedArray]) -> Any:
     args = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(args, axes, strict=True)]
     axes, n = [None if d is None else 0 for d in axes], len(of.inexact)
     size = next(x.shape[0] for x, d in zip(args, axes, strict=True) if d is not None)
@@ -163,7 +169,7 @@ def _batch(args: Any, axes: Any, *, of: LinearMap, avals: Any) -> Any:
     return _batched(of, axes[:n], axes[n:], zeros)(args[:n], args[n:], shapes), zeros
 
 
-def _batched(of: LinearMap, at: list[Any], x: list[Any], y: list[Any]) -> LinearMap:
+def _batched(of: LinearMap, at: Axes, x: Axes, y: Axes) -> LinearMap:
     """A map for each element of a batch; an axis `None` is in `x` what all share, in `y` the sum of all."""
 
     def apply(where: Arrays, xs: Arrays) -> Arrays:

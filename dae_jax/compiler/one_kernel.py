@@ -4,17 +4,19 @@ XLA:CPU runs a loop body as a sequence of kernels and pays for each launch; for 
 4 to 12 times the arithmetic.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, PyTree
 
 from .kernel_call import as_kernel
 from .linear_map import Arrays, LinearMap, forward_map, is_inexact, moved
 from .settings import one_kernel_enabled
+from .types import TreeDef
 
 
 PullBack = Callable[[Any, Any], list[Any]]
@@ -42,16 +44,16 @@ def one_kernel(
 
 
 def _reverse(fn: Callable[..., Any], pull_back: PullBack | None, forward: Callable[..., Any]) -> Callable[..., Any]:
-    def flat(*args: Any) -> Any:
+    def flat(*args: PyTree) -> Any:
         leaves, treedef = jax.tree.flatten(args)
         kernel = as_kernel(fn)
 
         @jax.custom_jvp
-        def solve(*xs: Any) -> Any:
+        def solve(*xs: Array) -> Any:
             return kernel(*jax.tree.unflatten(treedef, xs))
 
         @solve.defjvp
-        def _(xs: Any, dxs: Any) -> Any:
+        def _(xs: Sequence[Array], dxs: Sequence[Array]) -> Any:
             out = solve(*xs)
             ys, of_ys = jax.tree.flatten(out)
             push = _derivative(
@@ -70,9 +72,9 @@ def _derivative(
     fn: Callable[..., Any],
     pull_back: PullBack | None,
     forward: Callable[..., Any],
-    of_xs: Any,
+    of_xs: TreeDef,
     inexact_xs: list[bool],
-    of_ys: Any,
+    of_ys: TreeDef,
     inexact_ys: list[bool],
 ) -> LinearMap:
     """dx ↦ J(x) dx, with its transpose and with the second derivative in both modes.
@@ -95,7 +97,10 @@ def _derivative(
     def pulled_forwards(xs: Arrays, cotangents: Arrays) -> Arrays:
         """The same by one forward derivative for each number in `xs`."""
         directions, unflatten = ravel_pytree([jnp.zeros_like(x) for x in inexact(xs)])
-        slope = lambda d: sum(jnp.sum(c * dy) for c, dy in zip(cotangents, pushed(xs, unflatten(d)), strict=True))
+
+        def slope(d: Array) -> Any:
+            return sum(jnp.sum(c * dy) for c, dy in zip(cotangents, pushed(xs, unflatten(d)), strict=True))
+
         return unflatten(jax.vmap(slope)(jnp.eye(directions.size, dtype=directions.dtype)))
 
     def bent(at: Arrays, dxs: Arrays) -> Arrays:
@@ -117,11 +122,11 @@ def _derivative(
 
 
 def _plain_pull_back(fn: Callable[..., Any]) -> PullBack:
-    def pull_back(args: Any, cotangent: Any) -> list[Any]:
+    def pull_back(args: PyTree, cotangent: PyTree) -> list[Any]:
         leaves, treedef = jax.tree.flatten(args)
         exact = [not is_inexact(x) for x in leaves]
 
-        def of_inexact(*zs: Any) -> list[Any]:
+        def of_inexact(*zs: Array) -> list[Any]:
             rest = iter(zs)
             merged = [x if e else next(rest) for e, x in zip(exact, leaves, strict=True)]
             return inexact(fn(*jax.tree.unflatten(treedef, merged)))
@@ -131,18 +136,18 @@ def _plain_pull_back(fn: Callable[..., Any]) -> PullBack:
     return pull_back
 
 
-def inexact(tree: Any) -> list[Any]:
+def inexact(tree: PyTree) -> list[Any]:
     """The leaves that have derivatives."""
     return list(filter(is_inexact, jax.tree.leaves(tree)))
 
 
 def _forward(fn: Callable[..., Any]) -> Callable[..., Any]:
     @jax.custom_jvp
-    def solve(*args: Any) -> Any:
+    def solve(*args: PyTree) -> Any:
         return as_kernel(fn)(*args)
 
     @solve.defjvp
-    def _(primals: Any, tangents: Any) -> Any:
+    def _(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
         return _forward(lambda p, t: jax.jvp(fn, p, t))(primals, tangents)
 
     return solve

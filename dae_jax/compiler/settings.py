@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 
-from ._compat import backends_are_initialised
+from ._compat import backends_are_initialised, setting
 
 
 COMPILERS = ("llvm", "xla", "off")
@@ -43,7 +43,7 @@ def current() -> Settings:
 
 def one_kernel_enabled() -> bool:
     """Whether solves that are traced now may become one kernel; what JAX is told not to compile does not."""
-    return current().compiler != "off" and not jax.config.jax_disable_jit
+    return current().compiler != "off" and not setting("jax_disable_jit")
 
 
 def processors() -> int:
@@ -134,7 +134,7 @@ def configure(
     return restore
 
 
-def _units(check: Any) -> int:
+def _units(check: object) -> int:
     if isinstance(check, bool) or check in (0, 1):
         return UNITS * int(check)
     if not isinstance(check, int) or check < 0:
@@ -142,7 +142,7 @@ def _units(check: Any) -> int:
     return check
 
 
-def _count(threads: Any, name: str) -> int:
+def _count(threads: object, name: str) -> int:
     if type(threads) is not int or threads < 1:
         raise ValueError(f"{name} must be a number of threads of at least 1, but is {threads!r}.")
     return threads

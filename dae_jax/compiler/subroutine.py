@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
+from jaxtyping import PyTree
 
 
 def subroutine(fn: Callable[..., Any], **jit_options: Any) -> Callable[..., Any]:
@@ -17,7 +18,7 @@ def subroutine(fn: Callable[..., Any], **jit_options: Any) -> Callable[..., Any]
     stage was computed three times over (double pendulum, DOP853: 280 ns a step against 230).
     """
 
-    def body(*args: Any) -> Any:
+    def body(*args: PyTree) -> Any:
         # What fn calls is inlined; XLA would share out the last operation of a function with a single result among
         # threads if that is large, which cannot be done inside a kernel.
         with set_xla_metadata(inlineable=None, xla_cpu_small_call=None):
@@ -26,7 +27,7 @@ def subroutine(fn: Callable[..., Any], **jit_options: Any) -> Callable[..., Any]
     call = jax.jit(body, **jit_options)
 
     @functools.wraps(fn)
-    def called(*args: Any) -> Any:
+    def called(*args: PyTree) -> Any:
         on_cpu = jax.default_backend() == "cpu"
         with set_xla_metadata(inlineable="false") if on_cpu else contextlib.nullcontext():
             return call(*args)[0]

@@ -9,9 +9,11 @@ from typing import Any
 import jax
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
+from jaxtyping import Array
 
 from .jaxprs.walk import equations
 from .subroutine import subroutine
+from .types import Equation
 
 
 # What XLA:CPU cannot emit inside a single function: library calls, host callbacks, collectives, sorts. What lineax's
@@ -35,7 +37,7 @@ def hindrances(jaxpr: ClosedJaxpr | Jaxpr) -> tuple[str, ...]:
     return tuple(dict.fromkeys([name for name in found if name] or ["size"] * (len(found) > LIMIT)))
 
 
-def _hinders(eqn: Any) -> bool:
+def _hinders(eqn: Equation) -> bool:
     name = eqn.primitive.name
     if eqn.effects:
         return True
@@ -66,7 +68,7 @@ def compiled(jaxpr: ClosedJaxpr, batched: bool = False) -> Callable[..., list[An
     if not qualifies(jaxpr, batched):
         return jax.jit(jaxpr_as_fun(jaxpr))
 
-    def call(*args: Any) -> list[Any]:
+    def call(*args: Array) -> list[Any]:
         # The kernel has nothing but a call in it: XLA aborts where one of its parameters is not the operand of anything.
         with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
             return jax.jit(lambda *xs: subroutine(jaxpr_as_fun(jaxpr))(*xs))(*args)

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import diffrax
 import equinox as eqx
@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import optimistix
 
+from ..equations.manifold_ode import Equations, ManifoldODE
 from ..formulations import AbstractFormulation
 from ..linalg import rms_norm
 from ..solution import RESULTS, Interpolation
@@ -21,9 +22,14 @@ from ..solvers import (
     first_step,
     takes_residuals,
 )
+from ..types import Args, BoolLike, Time, Y
 from .problem import Problem
 from .start import is_saved_part
 from .trajectory_adjoint import as_it_is, can_be_taped
+
+
+if TYPE_CHECKING:
+    from .program import Solve
 
 
 class Decode(eqx.Module):
@@ -32,9 +38,9 @@ class Decode(eqx.Module):
     formulation: AbstractFormulation
     solver: diffrax.AbstractSolver
 
-    def __call__(self, t: Any, y: Any, ode: Any) -> Any:
+    def __call__(self, t: Time, y: Y, ode: Equations) -> Any:
         if isinstance(self.solver, AbstractManifoldSolver):
-            y = self.solver.retract(t, y, ode)
+            y = self.solver.retract(t, y, cast(ManifoldODE, ode))
         return self.formulation.decode(t, y, ode)
 
 
@@ -45,11 +51,11 @@ class View(eqx.Module):
     decode: Decode
     args: Any
 
-    def __call__(self, t: Any, y: Any, ode: Any) -> Any:
+    def __call__(self, t: Time, y: Y, ode: Equations) -> Any:
         return self.fn(t, self.decode(t, y, ode), self.args)
 
 
-def call(solve: Any, problem: Problem) -> tuple[Any, ...]:
+def call(solve: "Solve", problem: Problem) -> tuple[Any, ...]:
     """`diffrax.diffeqsolve` on what the formulation makes of the problem; the fields of its solution, and the end."""
     t0, t1, dt0, args = problem.t0, problem.t1, problem.dt0, problem.args
     y, ode = solve.formulation.encode(*problem.start, problem.rank)
@@ -59,7 +65,7 @@ def call(solve: Any, problem: Problem) -> tuple[Any, ...]:
         solver, controller = _of_residuals(solver, controller)
         dt0 = first_step(ode.start, solver, t0, t1, y) if dt0 is None else dt0
 
-    def saved(part: Any) -> Any:
+    def saved(part: diffrax.SubSaveAt) -> Any:
         return part if part.fn is as_it_is else eqx.tree_at(lambda s: s.fn, part, View(part.fn, decode, args))
 
     subs = {
@@ -67,12 +73,13 @@ def call(solve: Any, problem: Problem) -> tuple[Any, ...]:
         "end": diffrax.SubSaveAt(t1=True, fn=decode),
     }
     saveat = eqx.tree_at(lambda s: s.subs, solve.saveat, subs, is_leaf=lambda x: x is None)
-    event = solve.event and dataclasses.replace(
-        solve.event,
+    event = cast(diffrax.Event | None, solve.event)
+    event = event and dataclasses.replace(
+        event,
         cond_fn=jax.tree.map(
             lambda c, up: _on_states(c, decode, args, up),
-            solve.event.cond_fn,
-            solve.event.direction,
+            event.cond_fn,
+            event.direction,
             is_leaf=lambda x: x is None or callable(x),
         ),
     )
@@ -97,7 +104,7 @@ def call(solve: Any, problem: Problem) -> tuple[Any, ...]:
     return sol.t0, sol.t1, ts["user"], ys["user"], interpolation, stats, result, sol.event_mask, end
 
 
-def _for_derivative(solve: Any, solver: Any, y: Any) -> Any:
+def _for_derivative(solve: "Solve", solver: diffrax.AbstractSolver, y: Y) -> Any:
     """The solver as diffrax's reverse derivative needs it; the tape knows accepted steps only."""
     size = sum(leaf.size for leaf in jax.tree.leaves(y))
     ours = (isinstance(solver, AbstractManifoldSolver) or takes_residuals(solver)) and not hasattr(
@@ -107,7 +114,7 @@ def _for_derivative(solve: Any, solver: Any, y: Any) -> Any:
     return WithoutFailedSteps(solver) if ours and by_diffrax else solver
 
 
-def _fitted(controller: Any, t0: Any, t1: Any) -> Any:
+def _fitted(controller: diffrax.AbstractStepSizeController, t0: Time, t1: Time) -> Any:
     """The controller with a smallest step at the resolution of time, below which a solve cannot get on, and its default
     norm without a library call.
     """
@@ -121,7 +128,7 @@ def _fitted(controller: Any, t0: Any, t1: Any) -> Any:
     return dataclasses.replace(controller, dtmin=floor, force_dtmin=False)
 
 
-def _of_residuals(solver: Any, controller: Any) -> tuple[Any, Any]:
+def _of_residuals(solver: diffrax.AbstractSolver, controller: diffrax.AbstractStepSizeController) -> tuple[Any, Any]:
     """A solver with the controller's tolerances; it finds by itself where time resolves no smaller step."""
     if not isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
         return solver, controller
@@ -131,10 +138,10 @@ def _of_residuals(solver: Any, controller: Any) -> tuple[Any, Any]:
     return dataclasses.replace(solver, rtol=rtol, atol=atol), controller
 
 
-def _on_states(cond: Callable[..., Any], decode: Any, args: Any, up: bool | None) -> Callable[..., Any]:
+def _on_states(cond: Callable[..., BoolLike | Time], decode: Decode, args: Args, up: bool | None) -> Callable[..., Any]:
     user_args = args
 
-    def condition(t: Any, y: Any, args: Any, **kwargs: Any) -> Any:
+    def condition(t: Time, y: Y, args: Equations, **kwargs: object) -> Any:
         value = cond(t, decode(t, y, args), user_args, **kwargs)
         # NaN crosses in no direction: it ends the solve here, which then says so.
         return value if up is None else jnp.where(jnp.isnan(value), 1 if up else -1, value)

@@ -9,9 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array, PyTree
 
 from .._compat import CALLBACK_LOG, messages, unvmap_any
 from ..solution import RESULTS, DAESolution
+from ..types import BoolScalar
 
 
 OKAY = tuple(int(code._value) for code in (RESULTS.successful, RESULTS.event_occurred))
@@ -34,7 +36,7 @@ def _details(sol: DAESolution) -> tuple[Any, ...]:
     return sol.result._value, sol.stats["end_time"], sol.t0, sol.t1, sol.stats["num_steps"]
 
 
-def _sentence(code: Any, end: Any, t0: Any, t1: Any, steps: Any) -> str | None:
+def _sentence(code: np.ndarray, end: np.ndarray, t0: np.ndarray, t1: np.ndarray, steps: np.ndarray) -> str | None:
     """The sentence for numbers, or for arrays of a batch: that of the first of those that failed."""
     failed = np.flatnonzero(~np.isin(code, OKAY))
     if not failed.size:
@@ -65,18 +67,18 @@ def raised_in_the_program(sol: DAESolution) -> DAESolution:
 
 # A custom derivative, so that the branch is none in a derivative.
 @eqx.filter_custom_jvp
-def _passed(arrays: Any, failed: Any, details: Any) -> Any:
+def _passed(arrays: PyTree[Array], failed: BoolScalar, details: tuple[Array, ...]) -> Any:
     shapes = jax.eval_shape(lambda: arrays)
     fail = lambda: jax.pure_callback(_raise, shapes, *details, vmap_method="expand_dims")
     return lax.cond(unvmap_any(failed), fail, lambda: arrays)
 
 
 @_passed.def_jvp
-def _(primals: Any, tangents: Any) -> Any:
+def _(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
     return _passed(*primals), tangents[0]
 
 
-def _raise(*details: Any) -> Any:
+def _raise(*details: Array | np.ndarray) -> Any:
     # JAX would print the traceback of this function before the error that has it.
     logging.getLogger(CALLBACK_LOG).addFilter(_without_ours)
     raise SolveFailed(_sentence(*map(np.asarray, details)))

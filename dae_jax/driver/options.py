@@ -2,18 +2,19 @@
 
 import functools
 import typing
-from typing import Any
 
 import diffrax
 import jax
 import numpy as np
 import optimistix
+from jax.core import Tracer
 
 from .._compat import use_stepsize_tol
 from ..formulations import AbstractFormulation, AbstractResidualFormulation
 from ..solvers import AbstractManifoldSolver, is_explicit, takes_residuals
+from ..types import Time
 from ..validate.states import NUMBERS, brief
-from .resets import Jump
+from .resets import Reset
 
 
 EXPECTED = {
@@ -24,15 +25,15 @@ EXPECTED = {
     ),
     "adjoint": (diffrax.AbstractAdjoint, "a diffrax adjoint such as diffrax.ForwardMode()"),
     "event": (
-        (diffrax.Event, Jump, type(None)),
-        "a diffrax.Event(condition), which ends the solve, or a dae_jax.Jump(condition, jump), after which it goes on",
+        (diffrax.Event, Reset, type(None)),
+        "a diffrax.Event(condition), which ends the solve, or a dae_jax.Reset(condition, reset), after which it goes on",
     ),
     "progress_meter": (diffrax.AbstractProgressMeter, "a progress meter such as diffrax.TqdmProgressMeter()"),
 }
 
 
 def refuse_wrong_options(
-    saveat: Any, controller: Any, adjoint: Any, event: Any, max_steps: Any, progress_meter: Any
+    saveat: object, controller: object, adjoint: object, event: object, max_steps: object, progress_meter: object
 ) -> None:
     """Refuses options that are not what diffrax takes."""
     given = (saveat, controller, adjoint, event, progress_meter)
@@ -57,7 +58,7 @@ def refuse_wrong_options(
 _right_types: set[tuple[type, ...]] = set()
 
 
-def _refuse_wrong_types(types: tuple[type, ...], given: tuple[Any, ...]) -> None:
+def _refuse_wrong_types(types: tuple[type, ...], given: tuple[object, ...]) -> None:
     # Looked up, as asking is slow: diffrax's classes are abstract ones.
     if types in _right_types:
         return
@@ -67,13 +68,11 @@ def _refuse_wrong_types(types: tuple[type, ...], given: tuple[Any, ...]) -> None
     _right_types.add(types)
 
 
-def _refuse_bad_tolerances(controller: Any) -> None:
+def _refuse_bad_tolerances(controller: object) -> None:
     if type(controller) is not diffrax.PIDController:
         return
     given = [controller.rtol, controller.atol]
-    if all(type(x) is float and x > 0 for x in given) or any(
-        isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(given)
-    ):
+    if all(type(x) is float and x > 0 for x in given) or any(isinstance(x, Tracer) for x in jax.tree.leaves(given)):
         return
     leaves = jax.tree.leaves(given)
     fine = all(isinstance(x, NUMBERS) and np.all(np.asarray(x) >= 0) for x in leaves)
@@ -84,7 +83,7 @@ def _refuse_bad_tolerances(controller: Any) -> None:
         )
 
 
-def refuse_misfits(formulation: Any, solver: Any) -> None:
+def refuse_misfits(formulation: AbstractFormulation, solver: diffrax.AbstractSolver) -> None:
     """Refuses pairs of formulation and solver that make no sense."""
     refuse_no_solver(solver)
     if not isinstance(formulation, AbstractFormulation):
@@ -116,7 +115,7 @@ def refuse_misfits(formulation: Any, solver: Any) -> None:
         )
 
 
-def refuse_no_solver(solver: Any) -> None:
+def refuse_no_solver(solver: object) -> None:
     """Refuses what is no solver of ODEs or of residuals."""
     if not isinstance(solver, diffrax.AbstractSolver):
         other = ": give it as `formulation`" if isinstance(solver, AbstractFormulation) else ""
@@ -129,12 +128,14 @@ def refuse_no_solver(solver: Any) -> None:
 
 
 @functools.lru_cache
-def _takes_one_ode(term_structure: Any) -> bool:
+def _takes_one_ode(term_structure: object) -> bool:
     kind = typing.get_origin(term_structure) or term_structure
     return isinstance(kind, type) and issubclass(diffrax.ODETerm, kind)
 
 
-def refuse_other_steps(solver: Any, controller: Any, dt0: Any) -> None:
+def refuse_other_steps(
+    solver: diffrax.AbstractSolver, controller: diffrax.AbstractStepSizeController | None, dt0: Time | None
+) -> None:
     """Refuses a step-size control that the solver cannot have."""
     name, adapts = type(solver).__name__, isinstance(solver, diffrax.AbstractAdaptiveSolver)
     if dt0 is None and not adapts:
@@ -154,13 +155,13 @@ def refuse_other_steps(solver: Any, controller: Any, dt0: Any) -> None:
         )
 
 
-def _has_no_tolerance(solver: Any) -> bool:
+def _has_no_tolerance(solver: diffrax.AbstractSolver) -> bool:
     """Whether an implicit solver of diffrax takes its tolerances from the step-size control."""
     finder = getattr(solver, "root_finder", None)
     return finder is not None and getattr(finder, "rtol", None) is use_stepsize_tol
 
 
-def refuse_no_event(solver: Any) -> None:
+def refuse_no_event(solver: diffrax.AbstractSolver) -> None:
     """Refuses solvers whose dense output diffrax cannot look for an event on."""
     if not getattr(solver, "locates_events", True):
         raise ValueError(

@@ -1,21 +1,27 @@
 """How a solve ended: one code for what diffrax says, what its start and end show, and what is not finite."""
 
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
+import diffrax
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, PyTree
 
 from ..solution import RESULTS, DAESolution, all_finite, precision_of
 from ..solvers import takes_residuals
-from .problem import Problem
+from .problem import Problem, count_of
 from .start import is_saved_part, saved_parts
 
 
-def judged(solve: Any, out: Any, problem: Problem, found: Any) -> DAESolution:
+if TYPE_CHECKING:
+    from .program import Solve
+
+
+def judged(solve: "Solve", out: Sequence[PyTree], problem: Problem, found: tuple[PyTree, ...]) -> DAESolution:
     """The solution, with the code of what is wrong with it; `found`: what a look at its start and its end has shown."""
-    *fields, code, event_mask = out
+    t0, t1, ts, ys, interpolation, stats, code, event_mask = out
     (start, _), end, (finite_end, defined) = found
-    _, _, ts, ys, *_ = fields
     failed = lambda name, instead, when=True: RESULTS.where((code == name) & when, instead, code)
     if takes_residuals(solve.solver):
         code = failed(RESULTS.dt_min_reached, RESULTS.error_too_large)
@@ -24,11 +30,11 @@ def judged(solve: Any, out: Any, problem: Problem, found: Any) -> DAESolution:
     code = failed(RESULTS.dt_min_reached, RESULTS.step_rejected)
     code = failed(RESULTS.nonlinear_divergence, RESULTS.off_manifold)
     finite = [all_finite(*pair) for pair in _saved(solve.saveat, ts, ys)] if ts is not None else []
-    precision = precision_of(fields[0].dtype, solve.controller)
+    precision = precision_of(t0.dtype, solve.controller)
     went_well = (code == RESULTS.successful) | (code == RESULTS.event_occurred)
     code = RESULTS.where(went_well & ~jnp.all(jnp.stack([finite_end, *finite])), RESULTS.not_finite, code)
     # A root finder that met a condition that is not a number ends anywhere, also at a time that is none.
-    lost = ~defined | ~jnp.isfinite(fields[5]["end_time"])
+    lost = ~defined | ~jnp.isfinite(stats["end_time"])
     for name in ("nonlinear_max_steps_reached", "nonfinite_input", "nonfinite"):
         code = failed(getattr(RESULTS, name), RESULTS.undefined_condition, lost)
     went_well = (code == RESULTS.successful) | (code == RESULTS.event_occurred)
@@ -43,11 +49,11 @@ def judged(solve: Any, out: Any, problem: Problem, found: Any) -> DAESolution:
         ("inconsistent_start", "dependent_constraints", "irregular_mass", "ambiguous_start"), 1
     ):
         code = RESULTS.where(start == wrong, getattr(RESULTS, name), code)
-    rank = problem.rank[1] if isinstance(problem.rank, tuple) else problem.rank
-    return DAESolution(*fields, code, event_mask, problem.args, rank, precision)
+    rank = count_of(problem.rank)
+    return DAESolution(t0, t1, ts, ys, interpolation, stats, code, event_mask, problem.args, rank, precision)
 
 
-def _saved(saveat: Any, ts: Any, ys: Any) -> list[tuple[Any, Any]]:
+def _saved(saveat: diffrax.SaveAt, ts: PyTree[Array], ys: PyTree[Array]) -> list[tuple[Any, Any]]:
     """The (times, states) of each part of `saveat`."""
     structure = jax.tree.structure(saveat.subs, is_leaf=is_saved_part)
     return [
@@ -55,7 +61,7 @@ def _saved(saveat: Any, ts: Any, ys: Any) -> list[tuple[Any, Any]]:
     ]
 
 
-def _outside(saveat: Any, problem: Problem) -> Any:
+def _outside(saveat: diffrax.SaveAt, problem: Problem) -> Any:
     """Whether a time to save at is beyond an end of the solve: diffrax pads it like a time that was not reached."""
     low, high = jnp.minimum(problem.t0, problem.t1), jnp.maximum(problem.t0, problem.t1)
     times = [part.ts for part in saved_parts(saveat) if part.ts is not None]

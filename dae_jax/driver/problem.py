@@ -7,9 +7,13 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from ..compiler import one_kernel_enabled
+from ..compiler.types import Arrays
 from ..equations.constraint_jacobian import Rank
+from ..systems import System
+from ..types import Args, Scalar, State
 
 
 @functools.partial(
@@ -23,18 +27,23 @@ class Problem:
     independent there (`None`: all).
     """
 
-    system: Any
-    t0: Any
-    t1: Any
-    dt0: Any
-    y0: Any
-    args: Any
+    system: System
+    t0: Scalar
+    t1: Scalar
+    dt0: Scalar | None
+    y0: State
+    args: Args
     rank: int | Rank | None
 
     @property
-    def start(self) -> tuple[Any, Any, Any, Any]:
+    def start(self) -> tuple[System, Scalar, State, Args]:
         """(system, t0, y0, args)."""
         return self.system, self.t0, self.y0, self.args
+
+
+def count_of(rank: int | Rank | None) -> int | None:
+    """How many constraints are independent in all."""
+    return rank[1] if isinstance(rank, tuple) else rank
 
 
 class Program(NamedTuple):
@@ -45,7 +54,7 @@ class Program(NamedTuple):
     types: tuple[type, ...]
     one_kernel: bool
 
-    def whole(self, arrays: list[Any]) -> Any:
+    def whole(self, arrays: Arrays) -> Any:
         """The pytree with these arrays."""
         rest = iter(arrays)
         return jax.tree.unflatten(self.treedef, [next(rest) if x is _ARRAY else x for x in self.leaves])
@@ -54,7 +63,7 @@ class Program(NamedTuple):
 _ARRAY = object()
 
 
-def split(tree: Any) -> tuple[Program, list[Any]]:
+def split(tree: PyTree) -> tuple[Program, list[Any]]:
     """What a solve is given, as a program and its arrays."""
     leaves, treedef = jax.tree.flatten(tree)
     arrays = [x for x in leaves if isinstance(x, jax.Array | np.ndarray | np.generic)]
@@ -69,7 +78,7 @@ class Split(eqx.Module):
     rest: Any = eqx.field(static=True)
 
     @classmethod
-    def of(cls, tree: Any) -> "Split":
+    def of(cls, tree: PyTree) -> "Split":
         return cls(*eqx.partition(tree, eqx.is_array))
 
     def whole(self) -> Any:

@@ -9,19 +9,22 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 from .._compat import trace_state_clean
 from ..compiler import PullBack, inexact, one_kernel, waiting
+from ..compiler.types import Arrays
 from ..consistent import look_at_end, look_at_start
 from ..equations.regularity import COARSE
 from ..formulations import AbstractFormulation
 from ..solution import DAESolution
 from ..solvers import AbstractManifoldSolver, economical, takes_residuals
+from ..types import Scalar, State
 from ..validate.user_functions import refuse_wrong_functions, returned
 from .diffrax_call import Decode, View, call
 from .outcome import judged
 from .problem import Problem, Program, Split, split
-from .resets import Jump, refuse_wrong_event, solve_with_jumps
+from .resets import Reset, refuse_wrong_event, solve_with_resets
 from .start import saved_parts
 from .trajectory_adjoint import Taped, can_be_taped, cotangents, recorded, saved_times
 
@@ -39,23 +42,23 @@ def _make_room() -> None:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _jitted(program: Program, arrays: list[Any]) -> Any:
+def _jitted(program: Program, arrays: Arrays) -> Any:
     _traced.append(program)
     solve, problem = program.whole(jax.tree.map(jnp.asarray, arrays))
     waiting.begin(always=not isinstance(solve.progress_meter, diffrax.NoProgressMeter))
     solve.refuse_wrong_functions(problem)
-    sol, as_expected = solve_with_jumps(solve, problem) if isinstance(solve.event, Jump) else solve(problem)
+    sol, as_expected = solve_with_resets(solve, problem) if isinstance(solve.event, Reset) else solve(problem)
     return Split.of(sol), as_expected
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _numbers(program: Program, arrays: list[Any]) -> Split:
+def _numbers(program: Program, arrays: Arrays) -> Split:
     """diffrax's part of a solve; jitted, so that derivatives and batches of it find it traced."""
     solve, problem = program.whole(arrays)
     return Split.of(call(solve, problem))
 
 
-def run(program: Program, arrays: list[Any]) -> tuple[DAESolution, Any, float]:
+def run(program: Program, arrays: Arrays) -> tuple[DAESolution, Any, float]:
     """The solution of (`Solve`, `Problem`), whether the start was consistent and of the given rank, and the seconds spent on
     compiling this.
     """
@@ -75,7 +78,7 @@ class Solve(eqx.Module):
     saveat: diffrax.SaveAt
     controller: diffrax.AbstractStepSizeController
     adjoint: diffrax.AbstractAdjoint
-    event: diffrax.Event | Jump | None
+    event: diffrax.Event | Reset | None
     max_steps: int | None = eqx.field(static=True)
     progress_meter: diffrax.AbstractProgressMeter
 
@@ -103,7 +106,7 @@ class Solve(eqx.Module):
         for part in saved_parts(self.saveat):
             returned("saveat.fn(t, y, args)", part.fn, *start)
 
-    def _check(self, problem: Problem, end: Any) -> tuple[Callable[..., Any], list[Any]]:
+    def _check(self, problem: Problem, end: tuple[Scalar, State]) -> tuple[Callable[..., Any], list[Any]]:
         """What is wrong with the start and the end, as a function of arrays, and its arrays."""
         manifold, residual = isinstance(self.solver, AbstractManifoldSolver), takes_residuals(self.solver)
         # Points between the steps of a solver of residuals are off by what its dense output is.
@@ -116,15 +119,16 @@ class Solve(eqx.Module):
         program, arrays = split((*problem.start, end, tolerances, self.event))
         invertible, rank = self.formulation.inverts_mass, problem.rank
 
-        def check(arrays: Any) -> Any:
-            *inputs, end, tolerances, event = program.whole(arrays)
-            start = look_at_start(*inputs, rank, invertible)
-            (t, state), (*_, args) = end, inputs
+        def check(arrays: Arrays) -> Any:
+            system, t0, y0, args, end, tolerances, event = program.whole(arrays)
+            start = look_at_start(system, t0, y0, args, rank, invertible)
+            t, state = end
             conditions = [] if event is None else jax.tree.leaves(event.cond_fn, is_leaf=callable)
             finite = [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(state)]
             defined = [~jnp.isnan(condition(t, state, args)) for condition in conditions]
             numbers = (jnp.all(jnp.stack(finite)), jnp.all(jnp.asarray(defined, bool)))
-            return start, look_at_end(*inputs, rank, invertible, end, keeps, tolerances, residual), numbers
+            at_end = look_at_end(system, t0, y0, args, rank, invertible, end, keeps, tolerances, residual)
+            return start, at_end, numbers
 
         return check, arrays
 
@@ -132,7 +136,7 @@ class Solve(eqx.Module):
         """What can become one kernel: a function of arrays, and its arrays."""
         program, arrays = split((self, problem))
 
-        def numbers(arrays: list[Any]) -> Split:
+        def numbers(arrays: Arrays) -> Split:
             # JAX's derivatives name the (empty) mesh, and would trace anew what was traced without a name for it.
             with jax.sharding.use_abstract_mesh(jax.sharding.get_abstract_mesh()):
                 return _numbers(program, arrays)
@@ -146,7 +150,7 @@ class Solve(eqx.Module):
             return None
         program, _ = split((self, problem))
 
-        def pull_back(inputs: Any, cotangent: Any) -> list[Any]:
+        def pull_back(inputs: tuple[Arrays], cotangent: Split) -> list[Any]:
             (arrays,) = inputs
             solve, problem = program.whole(arrays)
             recording, also_arrays = dataclasses.replace(solve._forwards(), saveat=recorded(solve.saveat)).kernel(
@@ -156,7 +160,7 @@ class Solve(eqx.Module):
             numbers, others = eqx.partition(arrays, eqx.is_inexact_array)
             fixed: list[Any] = []
 
-            def encoded(numbers: Any) -> Any:
+            def encoded(numbers: PyTree) -> Any:
                 solve, problem = program.whole(eqx.combine(numbers, others))
                 found, fixed[:] = eqx.partition(solve._taped(problem), eqx.is_inexact_array)
                 return found

@@ -1,8 +1,9 @@
 """Solves that start again: where a condition crosses zero, the state or the equations change."""
 
 import dataclasses
+import warnings
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -11,75 +12,97 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from .._compat import while_loop
 from ..consistent import consistent_state
+from ..equations.constraint_jacobian import Rank
 from ..equations.structural_ode import underlying_ode
 from ..solution import RESULTS, DAESolution, precision_of
 from ..systems import System
+from ..types import Args, BoolLike, Scalar, State, Time, Y
 from ..validate.states import NUMBERS, brief, broadcast_to_state, describe
 from ..validate.user_functions import refuse_other_arguments, returned
-from .problem import Problem
+from .problem import Problem, count_of
 from .start import saved_parts
+
+
+if TYPE_CHECKING:
+    from .program import Solve
 
 
 # Entries of `stats` that do not add up over the parts of a solve.
 NO_COUNTS = ("max_steps", "end_time")
 
 
-class Jump(eqx.Module):
+class Reset(eqx.Module):
     """An `event` after which the solve goes on: a stop that is hit, a diode that switches.
 
     **Arguments**
 
     - `condition(t, y, args, **kwargs)`: a real number; an event is where it crosses zero, located on the solver's dense
       output.
-    - `jump(t, y, args) -> (y, args)`: the state and the `args` that the solve goes on with. The nearest consistent state to
+    - `reset(t, y, args) -> (y, args)`: the state and the `args` that the solve goes on with. The nearest consistent state to
       it is taken, in the sense of `consistent_state`.
     - `direction`: `True` for upcrossings only, `False` for downcrossings only.
     - `fixed`: entries of the state that are kept when it is made consistent, as in `consistent_state`.
-    - `most`: how many jumps there may be; one more ends the solve with `RESULTS.too_many_jumps`, and so do jumps that pile
+    - `max_resets`: how many there may be; one more ends the solve with `RESULTS.too_many_jumps`, and so do resets that pile
       up at one time.
 
-    A solve with a `Jump` saves what `SaveAt(t0=..., ts=..., t1=..., fn=...)` asks for: at the time of a jump, the state
+    A solve with a `Reset` saves what `SaveAt(t0=..., ts=..., t1=..., fn=...)` asks for: at the time of a reset, the state
     after it. `sol.stats["jumps"]` counts them, `sol.stats["jump_times"]` are their times, padded with infinity. As any
     event, it is found where the condition has different signs at the two ends of a step: two crossings in one step are
     none.
     """
 
     condition: Callable[..., Any]
-    jump: Callable[..., tuple[Any, Any]]
+    reset: Callable[..., tuple[Any, Any]]
     direction: bool | None = eqx.field(static=True, default=None)
     fixed: Any = None
-    most: int = eqx.field(static=True, default=100)
+    max_resets: int = eqx.field(static=True, default=100)
 
     def __check_init__(self) -> None:
-        for name in ("condition", "jump"):
+        for name in ("condition", "reset"):
             if not callable(getattr(self, name)):
-                raise TypeError(f"`{name}` of Jump must be a function, but is {brief(getattr(self, name))}.")
+                raise TypeError(f"`{name}` of Reset must be a function, but is {brief(getattr(self, name))}.")
         if self.direction not in (None, True, False):
             raise ValueError(
-                "`direction` of Jump must be True for upcrossings, False for downcrossings or None for both, but is "
+                "`direction` of Reset must be True for upcrossings, False for downcrossings or None for both, but is "
                 f"{brief(self.direction)}."
             )
-        if type(self.most) is not int or self.most < 1:
-            raise ValueError(f"`most` of Jump must be an integer of at least 1, but is {brief(self.most)}.")
+        if type(self.max_resets) is not int or self.max_resets < 1:
+            raise ValueError(
+                f"`max_resets` of Reset must be an integer of at least 1, but is {brief(self.max_resets)}."
+            )
 
 
-def refuse_wrong_event(event: Any, t: Any, y: Any, args: Any) -> None:
+def Jump(
+    condition: Callable[..., Any],
+    jump: Callable[..., tuple[Any, Any]],
+    direction: bool | None = None,
+    fixed: State = None,
+    most: int = 100,
+) -> Reset:
+    """The former name of `Reset`."""
+    warnings.warn("`Jump(..., most=...)` is called `Reset(..., max_resets=...)` now.", DeprecationWarning, stacklevel=2)
+    return Reset(condition, jump, direction, fixed, most)
+
+
+def refuse_wrong_event(event: diffrax.Event | Reset | None, t: Time, y: State, args: Args) -> None:
     """Refuses functions of an event that cannot be called with (t, y, args), or do not return what they must."""
     if event is None:
         return
-    conditions = [event.condition] if isinstance(event, Jump) else jax.tree.leaves(event.cond_fn, is_leaf=callable)
+    conditions = [event.condition] if isinstance(event, Reset) else jax.tree.leaves(event.cond_fn, is_leaf=callable)
     for condition in conditions:
         # A boolean that stays true is no event of which there is one.
-        _refuse_wrong_condition(condition, t, y, args, "f" if isinstance(event, Jump) else "fb")
-    if isinstance(event, Jump):
-        _refuse_wrong_jump(event, t, y, args)
+        _refuse_wrong_condition(condition, t, y, args, "f" if isinstance(event, Reset) else "fb")
+    if isinstance(event, Reset):
+        _refuse_wrong_reset(event, t, y, args)
 
 
-def _refuse_wrong_condition(condition: Any, t: Any, y: Any, args: Any, kinds: str) -> None:
+def _refuse_wrong_condition(
+    condition: Callable[..., Time | BoolLike], t: Time, y: State, args: Args, kinds: str
+) -> None:
     refuse_other_arguments("condition(t, y, args, **kwargs)", condition, 3, terms=None, solver=None, t0=None, t1=None)
     found = returned("condition(t, y, args, **kwargs)", condition, t, y, args)
     fits = isinstance(found, NUMBERS) and jnp.shape(found) == ()
@@ -90,12 +113,12 @@ def _refuse_wrong_condition(condition: Any, t: Any, y: Any, args: Any, kinds: st
         )
 
 
-def _refuse_wrong_jump(event: Jump, t: Any, y: Any, args: Any) -> None:
-    found = returned("jump(t, y, args)", event.jump, t, y, args)
+def _refuse_wrong_reset(event: Reset, t: Time, y: State, args: Args) -> None:
+    found = returned("reset(t, y, args)", event.reset, t, y, args)
     shapes = lambda tree: (jax.tree.structure(tree), [jnp.shape(x) for x in jax.tree.leaves(tree)])
     if not isinstance(found, tuple | list) or len(found) != 2 or shapes(tuple(found)) != shapes((y, args)):
         raise ValueError(
-            f"`jump(t, y, args)` must return (y, args), the state and the args to go on with, {describe((y, args))}, but "
+            f"`reset(t, y, args)` must return (y, args), the state and the args to go on with, {describe((y, args))}, but "
             f"returns {describe(found)}."
         )
     if event.fixed is not None:
@@ -103,11 +126,11 @@ def _refuse_wrong_jump(event: Jump, t: Any, y: Any, args: Any) -> None:
 
 
 def refuse_other_outputs(saveat: diffrax.SaveAt) -> None:
-    """Refuses what cannot be put together from the parts of a solve with jumps."""
+    """Refuses what cannot be put together from the parts of a solve with resets."""
     parts = saved_parts(saveat)
     if len(parts) != 1 or parts[0].steps or saveat.dense or saveat.solver_state or saveat.controller_state:
         raise ValueError(
-            "A solve with a Jump saves SaveAt(t0=..., ts=..., t1=..., fn=...) only, no steps or dense output."
+            "A solve with a Reset saves SaveAt(t0=..., ts=..., t1=..., fn=...) only, no steps or dense output."
         )
 
 
@@ -119,7 +142,7 @@ class _FromStart(eqx.Module):
     t0: Any
     level: Any
 
-    def __call__(self, t: Any, y: Any, args: Any, **kwargs: Any) -> Any:
+    def __call__(self, t: Time, y: Y, args: PyTree, **kwargs: object) -> Any:
         return self.sign * jnp.where(t == self.t0, self.level, self.condition(t, y, args, **kwargs))
 
 
@@ -140,11 +163,12 @@ class _Progress(NamedTuple):
     level: Float[Array, ""]
 
 
-def solve_with_jumps(solve: Any, problem: Problem) -> tuple[DAESolution, Any]:
-    """What `solve` gives, part by part; `solve.event` is a `Jump`."""
+def solve_with_resets(solve: "Solve", problem: Problem) -> tuple[DAESolution, Any]:
+    """What `solve` gives, part by part; `solve.event` is a `Reset`."""
     system, t0, y0, args = problem.start
     t1, rank = problem.t1, problem.rank
-    jump, (output,) = solve.event, saved_parts(solve.saveat)
+    reset, (output,) = solve.event, saved_parts(solve.saveat)
+    assert isinstance(reset, Reset)
     empty = jnp.zeros(0, t0.dtype)
     wanted = jnp.concatenate(
         [t0[None] if output.t0 else empty, empty if output.ts is None else output.ts, t1[None] if output.t1 else empty]
@@ -154,11 +178,11 @@ def solve_with_jumps(solve: Any, problem: Problem) -> tuple[DAESolution, Any]:
     going = int(RESULTS.event_occurred._value)
 
     def part(p: _Progress) -> tuple[DAESolution, Any, Any]:
-        level = _level_at_start(system, jump.condition, p.t, p.y, p.args, p.level, rank)
+        level = _level_at_start(system, reset.condition, p.t, p.y, p.args, p.level, rank)
         # A downcrossing, as bisection has to know which way it goes.
-        up = {True: -1, False: 1, None: jnp.sign(level)}[jump.direction]
+        up = {True: -1, False: 1, None: jnp.sign(level)}[reset.direction]
         event = diffrax.Event(
-            _FromStart(jump.condition, jnp.asarray(up, t0.dtype), p.t, level),
+            _FromStart(reset.condition, jnp.asarray(up, t0.dtype), p.t, level),
             optimistix.Bisection(resolution, resolution, flip=True),
             direction=False,
         )
@@ -177,31 +201,32 @@ def solve_with_jumps(solve: Any, problem: Problem) -> tuple[DAESolution, Any]:
         code = sol.result._value
         # Jumps so close that their order is round-off are no events any more.
         piled = (p.count > 0) & (sign * (end - p.t) <= 16 * resolution * (1 + jnp.abs(end)))
-        jumps, exhausted = code == going, piled | (p.count >= jump.most)
+        jumps, exhausted = code == going, piled | (p.count >= reset.max_resets)
         y, args = lax.cond(
             jumps & ~exhausted,
-            lambda: _after(system, jump, end, reached, p.args),
+            lambda: _after(system, reset, end, reached, p.args),
             lambda: (jax.tree.map(jnp.asarray, reached), p.args),
         )
-        times = jnp.where((jnp.arange(jump.most) == p.count) & jumps & ~exhausted, end, p.times)
+        times = jnp.where((jnp.arange(reset.max_resets) == p.count) & jumps & ~exhausted, end, p.times)
         code = jnp.where(jumps & exhausted, RESULTS.too_many_jumps._value, code)
         return _Progress(end, y, args, p.count + (jumps & ~exhausted), times, ts, ys, stats, code, level)
 
     unknown = jnp.zeros_like(t0)
-    shape = jax.eval_shape(part, _Progress(t0, y0, args, *[None] * 6, unknown))[0]
+    none: Any = None
+    shape = jax.eval_shape(part, _Progress(t0, y0, args, none, none, none, none, none, none, unknown))[0]
     unsaved = jax.tree.map(lambda x: jnp.full(x.shape, jnp.inf, x.dtype), shape.ys["wanted"])
     stats = {k: jnp.zeros((), int) for k in shape.stats if k not in NO_COUNTS}
     start = _Progress(
-        t0, y0, args, jnp.zeros((), int), jnp.full(jump.most, jnp.inf, t0.dtype),
+        t0, y0, args, jnp.zeros((), int), jnp.full(reset.max_resets, jnp.inf, t0.dtype),
         jnp.full_like(wanted, jnp.inf), unsaved, stats, jnp.asarray(going, RESULTS.successful._value.dtype), unknown,
     )  # fmt: skip
     kind: Any = "checkpointed" if solve.derivative() == "reverse" else "lax"
-    most = {"max_steps": jump.most + 1} if kind == "checkpointed" else {}
-    p = while_loop(lambda p: p.code == going, advance, start, kind=kind, **most)
+    max_steps = reset.max_resets + 1 if kind == "checkpointed" else None
+    p = while_loop(lambda p: p.code == going, advance, start, kind=kind, max_steps=max_steps)
     stats = {"max_steps": solve.max_steps, **p.stats, "end_time": p.t, "jumps": p.count, "jump_times": p.times}
     result = eqx.tree_at(lambda r: r._value, RESULTS.successful, p.code)
     precision = precision_of(t0.dtype, solve.controller)
-    sol = DAESolution(t0, t1, p.ts, p.ys, None, stats, result, None, args, rank, precision)
+    sol = DAESolution(t0, t1, p.ts, p.ys, None, stats, result, None, args, count_of(rank), precision)
     refused = (
         RESULTS.inconsistent_start,
         RESULTS.dependent_constraints,
@@ -211,15 +236,21 @@ def solve_with_jumps(solve: Any, problem: Problem) -> tuple[DAESolution, Any]:
     return sol, ~jnp.any(jnp.stack([p.code == code._value for code in refused]))
 
 
-def _after(system: System, jump: Jump, t: Any, y: Any, args: Any) -> tuple[Any, Any]:
-    """The state and the args after a jump."""
-    y, new = jump.jump(t, y, args)
-    y = consistent_state(system, t, y, new, fixed=jump.fixed)
+def _after(system: System, reset: Reset, t: Time, y: State, args: Args) -> tuple[Any, Any]:
+    """The state and the args after a reset."""
+    y, new = reset.reset(t, y, args)
+    y = consistent_state(system, t, y, new, fixed=reset.fixed)
     return y, jax.tree.map(lambda x, like: jnp.asarray(x, jnp.result_type(like)), new, args)
 
 
 def _level_at_start(
-    system: System, condition: Callable[..., Any], t: Any, y: Any, args: Any, before: Any, rank: int | None
+    system: System,
+    condition: Callable[..., Time],
+    t: Scalar,
+    y: State,
+    args: Args,
+    before: Scalar,
+    rank: int | Rank | None,
 ) -> Any:
     """The condition at the start of a part; where this is zero, the sign with which it leaves zero. That is the sign with
     which it came, −`before`, where its rate is not known.

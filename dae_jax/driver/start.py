@@ -7,13 +7,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
+from jax.typing import ArrayLike
 
 from ..consistent import unsolved, violation
 from ..equations.constraint_jacobian import Rank
 from ..equations.mechanical import MechanicalODE
 from ..equations.regularity import mass_is_regular, mass_message, rank_message, rank_of, redundancy
 from ..solution import RESULTS
-from ..systems import is_mechanism
+from ..systems import ConstrainedSystem, System, is_mechanism
+from ..types import Args, DType, State, Time
 from ..validate.states import NUMBERS, brief, refuse_wrong_state
 from ..validate.user_functions import not_finite, time_axis_advice
 
@@ -21,7 +24,7 @@ from ..validate.user_functions import not_finite, time_axis_advice
 ADVICE = "\n`dae_jax.consistent_state(system, t0, y0, args)` gives the nearest state that does not."
 
 
-def checked(system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any) -> tuple[Any, Any]:
+def checked(system: System, t0: Time, t1: Time, dt0: Time | None, y0: State, args: Args) -> tuple[Any, Any]:
     """`y0` and `args` as arrays, once their types and shapes are right."""
     refuse_wrong_state(system, y0)
     for leaf in jax.tree.leaves(y0):
@@ -29,12 +32,12 @@ def checked(system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any) -> tupl
         if dtype.kind != "f" or dtype.itemsize < 4:
             real = "; write 1.0 in place of 1" if dtype.kind in "iub" else ""
             raise ValueError(f"`y0` must hold floating-point numbers, float32 or float64, but has {dtype}{real}.")
-        if not isinstance(leaf, jax.core.Tracer) and not np.all(np.isfinite(np.asarray(leaf))):
+        if not isinstance(leaf, Tracer) and not np.all(np.isfinite(np.asarray(leaf))):
             raise ValueError(f"`y0` must be finite, but has NaN or infinity: {brief(leaf)}.")
     for name, value in (("t0", t0), ("t1", t1), ("dt0", dt0)):
         if value is not None or name != "dt0":
             refuse_no_time(name, value)
-    if dt0 is not None and not any(isinstance(x, jax.core.Tracer) for x in (t0, t1, dt0)):
+    if dt0 is not None and not any(isinstance(x, Tracer) for x in (t0, t1, dt0)):
         if dt0 == 0:
             raise ValueError(
                 "`dt0` must be a step, or None for steps that are chosen, but is 0: the order is t0, t1, dt0, y0."
@@ -46,23 +49,23 @@ def checked(system: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any) -> tupl
     return y0, jax.tree.map(lambda x: np.asarray(x, jnp.result_type(x)) if isinstance(x, float) else x, args)
 
 
-def refuse_no_time(name: str, value: Any) -> None:
+def refuse_no_time(name: str, value: Time | None) -> None:
     """Refuses what is no finite real number."""
     is_number = type(value) is float or (isinstance(value, NUMBERS) and jnp.shape(value) == ())
     if not is_number or np.dtype(jnp.result_type(value)).kind not in "fiu":
         raise ValueError(f"`{name}` must be a real number, but is {brief(value)}.")
-    if not isinstance(value, jax.core.Tracer) and not np.isfinite(value):
+    if not isinstance(value, Tracer) and not np.isfinite(np.asarray(value)):
         raise ValueError(f"`{name}` must be finite, but is {value}.")
 
 
-def as_array(x: Any, dtype: Any) -> Any:
+def as_array(x: ArrayLike, dtype: DType) -> Any:
     """`x` as an array; numbers stay numpy's, which costs less than the way to a device and back."""
     if isinstance(x, jax.Array):
         return x if x.dtype == dtype else x.astype(dtype)
     return np.asarray(x, dtype)
 
 
-def refuse_bad_times(saveat: Any, t0: Any, t1: Any) -> None:
+def refuse_bad_times(saveat: diffrax.SaveAt, t0: Time, t1: Time) -> None:
     """Times to save at must lie in the interval, in the order in which they are passed."""
     for sub in saved_parts(saveat):
         if sub.ts is not None:
@@ -79,7 +82,7 @@ def refuse_bad_times(saveat: Any, t0: Any, t1: Any) -> None:
                 raise ValueError("`saveat.ts` must be in the order in which the solve passes them.")
 
 
-def refuse_bad_start(system: Any, t0: Any, y0: Any, args: Any, invertible: bool) -> Rank | None:
+def refuse_bad_start(system: System, t0: Time, y0: State, args: Args, invertible: bool) -> Rank | None:
     """Refuses an inconsistent or singular start in words; the rank of the constraints if some are redundant. `invertible`:
     whether the mass matrix must be.
     """
@@ -101,14 +104,14 @@ def refuse_bad_start(system: Any, t0: Any, y0: Any, args: Any, invertible: bool)
     return rank_of(ode, redundant)
 
 
-def _advice(system: Any, t0: Any, y0: Any, args: Any) -> str:
+def _advice(system: System, t0: Time, y0: State, args: Args) -> str:
     """What to do about a start that violates its equations."""
     reason = not_finite(system, t0, y0, args) or time_axis_advice(system, t0, y0, args)
     return f"\n{reason}" if reason else ADVICE
 
 
 @eqx.filter_jit
-def _look(system: Any, t: Any, y0: Any, args: Any, invertible: bool) -> Any:
+def _look(system: ConstrainedSystem, t: Time, y0: State, args: Args, invertible: bool) -> Any:
     ode = MechanicalODE.of(system, t, y0, args)
     y = ode.encode(y0)
     mass, regular = ode.unchecked_mass(y[0]), mass_is_regular(ode, y[0], invertible)
@@ -116,15 +119,15 @@ def _look(system: Any, t: Any, y0: Any, args: Any, invertible: bool) -> Any:
 
 
 @eqx.filter_jit
-def _look_at_residual(system: Any, t: Any, y0: Any, args: Any) -> Any:
+def _look_at_residual(system: System, t: Time, y0: State, args: Args) -> Any:
     return unsolved(system, t, y0, args)
 
 
-def saved_parts(saveat: Any) -> list[Any]:
+def saved_parts(saveat: diffrax.SaveAt) -> list[Any]:
     """The `SubSaveAt`s of a `SaveAt`."""
     return [s for s in jax.tree.leaves(saveat.subs, is_leaf=is_saved_part) if is_saved_part(s)]
 
 
-def is_saved_part(x: Any) -> bool:
+def is_saved_part(x: object) -> bool:
     """For `jax.tree.map`."""
     return isinstance(x, diffrax.SubSaveAt)

@@ -7,23 +7,29 @@ which compile to a kernel each; diffrax's checkpoints need library calls. It is 
 solvers whose state is a function of the step's start.
 """
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Float, PyTree
 
 from ..solvers import is_recomputable
+from ..types import IntScalar, Scalar, Time, Y
 from .start import is_saved_part
+
+
+if TYPE_CHECKING:
+    from .program import Solve
 
 
 # Numbers on the tape, at most; beyond that diffrax's checkpoints.
 LARGEST_TAPE = 2**20
 
 
-def can_be_taped(solve: Any, size: int) -> bool:
+def can_be_taped(solve: "Solve", size: int) -> bool:
     """Whether the tape serves a solve with `size` unknowns."""
     saveat, part = solve.saveat, solve.saveat.subs
     return (
@@ -37,7 +43,7 @@ def can_be_taped(solve: Any, size: int) -> bool:
     )
 
 
-def recorded(saveat: Any) -> Any:
+def recorded(saveat: diffrax.SaveAt) -> Any:
     """`saveat`, with every accepted step saved beside."""
     tape = diffrax.SubSaveAt(t0=True, steps=True, fn=as_it_is)
     return eqx.tree_at(lambda s: s.subs, saveat, {"user": saveat.subs, "tape": tape}, is_leaf=is_saved_part)
@@ -60,7 +66,7 @@ class Taped(NamedTuple):
     view: Any
 
 
-def cotangents(taped: Taped, fixed_steps: bool, tape: tuple[Any, Any], wanted: Any) -> Taped:
+def cotangents(taped: Taped, fixed_steps: bool, tape: tuple[Float[Array, " steps"], Y], wanted: PyTree[Array]) -> Taped:
     """The cotangents of the inexact arrays in `taped`.
 
     **Arguments**
@@ -77,34 +83,34 @@ def cotangents(taped: Taped, fixed_steps: bool, tape: tuple[Any, Any], wanted: A
     direction = jnp.sign(taped.t1 - taped.t0)
     last = jnp.sum(jnp.isfinite(times)) - 1
 
-    def saved(numbers: Any, t: Any, y: Any) -> Any:
+    def saved(numbers: PyTree, t: Time, y: Y) -> Any:
         all_of = eqx.combine(numbers, rest)
         return all_of.view(t, y, all_of.ode)
 
-    def step(numbers: Any, y: Any, a: Any, b: Any) -> Any:
+    def step(numbers: PyTree, y: Y, a: Scalar, b: Scalar) -> Any:
         all_of = eqx.combine(numbers, rest)
         term, solver, ode = all_of.formulation.term(), all_of.solver, all_of.ode
         y1, _, dense, *_ = solver.step(term, a, b, y, ode, solver.init(term, a, b, y, ode), False)
         return y1, dense if save_times.size else None
 
-    def within(numbers: Any, dense: Any, a: Any, b: Any, t: Any) -> Any:
+    def within(numbers: PyTree, dense: PyTree, a: Scalar, b: Scalar, t: Time) -> Any:
         solver = eqx.combine(numbers, rest).solver
         return saved(numbers, t, solver.interpolation_cls(t0=a, t1=b, **dense).evaluate(t))
 
-    def shared(k: Any, cotangent: Any) -> tuple[Any, Any]:
+    def shared(k: IntScalar, cotangent: Scalar) -> tuple[Any, Any]:
         """The cotangent of the k-th time as those of t0 and t1: how diffrax's controllers make it from them."""
         evenly = jnp.where(k == 1, 0.0, (times[k] - taped.t0) / (taped.t1 - taped.t0)) if fixed_steps else 0.0
         fraction = jnp.where(times[k] == taped.t1, 1.0, evenly)
         return (1 - fraction) * cotangent, fraction * cotangent
 
-    def saves_in_step(k: Any, dense: Any, carry: Any) -> Any:
+    def saves_in_step(k: IntScalar, dense: PyTree, carry: tuple[PyTree, ...]) -> Any:
         a, b = times[k], times[k + 1]
 
-        def more(carry: Any) -> Any:
+        def more(carry: tuple[PyTree, ...]) -> Any:
             j = carry[0]
             return (j >= 0) & ((direction * (save_times[j] - a) > 0) | (k == 0))
 
-        def pull(carry: Any) -> Any:
+        def pull(carry: tuple[PyTree, ...]) -> Any:
             j, of_numbers, of_dense, of_a, of_b, of_times = carry
             _, pull_back = jax.vjp(within, numbers, dense, a, b, save_times[j])
             more_numbers, more_dense, more_a, more_b, of_t = pull_back(_entry(wanted, first + j))
@@ -120,7 +126,7 @@ def cotangents(taped: Taped, fixed_steps: bool, tape: tuple[Any, Any], wanted: A
 
         return lax.while_loop(more, pull, carry)
 
-    def one_step(carry: Any) -> Any:
+    def one_step(carry: tuple[PyTree, ...]) -> Any:
         k, j, of_y, of_numbers, of_t0, of_t1, of_times = carry
         (_, dense), pull_back = jax.vjp(step, numbers, _entry(points, k), times[k], times[k + 1])
         of_dense, of_a, of_b = _zeros(dense), jnp.zeros_like(of_t0), jnp.zeros_like(of_t0)
@@ -149,7 +155,9 @@ def cotangents(taped: Taped, fixed_steps: bool, tape: tuple[Any, Any], wanted: A
     return eqx.tree_at(lambda n: n.part.ts, of_numbers, of_numbers.part.ts + of_times)
 
 
-def saved_times(of_taped: Taped, part: Any, of_t0: Any, of_t1: Any, of_ts: Any) -> Taped:
+def saved_times(
+    of_taped: Taped, part: diffrax.SubSaveAt, of_t0: Scalar, of_t1: Scalar, of_ts: Float[Array, " times"]
+) -> Taped:
     """`cotangents` with those of the times that a solution holds: its t0, t1, and the ts that `part` asks for."""
     of_part = of_taped.part
     if part.ts is not None:
@@ -160,13 +168,13 @@ def saved_times(of_taped: Taped, part: Any, of_t0: Any, of_t1: Any, of_ts: Any) 
     return of_taped._replace(t0=of_t0, t1=of_t1, part=of_part)
 
 
-def _entry(tree: Any, i: Any) -> Any:
+def _entry(tree: PyTree[Array], i: IntScalar | int) -> Any:
     return jax.tree.map(lambda x: x[i], tree)
 
 
-def _zeros(tree: Any) -> Any:
+def _zeros(tree: PyTree[Array]) -> Any:
     return jax.tree.map(jnp.zeros_like, tree)
 
 
-def _sum(a: Any, b: Any) -> Any:
+def _sum(a: PyTree[Array], b: PyTree[Array]) -> Any:
     return jax.tree.map(jnp.add, a, b)

@@ -6,7 +6,8 @@ the other methods; `ode` is the `MechanicalODE` that the constraints belong to.
 
 import dataclasses
 import functools
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..linalg import Elimination, elimination, semidefinite_solve, take
 from ..structure import column_colouring, dependence, seed_matrix
+from ..types import Flat, Time
+from .manifold_ode import Normals
 
 
 # Up to this many multiplications a product is written as a sum, which can become part of a kernel; a dot cannot.
@@ -27,6 +30,15 @@ SPARSE_FROM = 5
 Rank = tuple[int, int]
 
 
+@runtime_checkable
+class Mechanism(Protocol):
+    """What is asked of a `MechanicalODE`."""
+
+    def mass(self, q: Flat) -> Array | None: ...
+    def constraint(self, t: Time, q: Flat) -> Array: ...
+    def constraint_jacobian(self, t: Time, q: Flat, v: Flat) -> Array: ...
+
+
 @dataclasses.dataclass(frozen=True)
 class DenseNormals:
     """A as a matrix; `rank` where some of its rows depend on others."""
@@ -35,20 +47,20 @@ class DenseNormals:
     nonholonomic: int
     rank: Rank | None
 
-    def at(self, ode: Any, t: Any, q: Any, v: Any) -> tuple[Float[Array, "c n"], Float[Array, "n c"]]:
+    def at(self, ode: Mechanism, t: Time, q: Flat, v: Flat) -> tuple[Float[Array, "c n"], Float[Array, "n c"]]:
         """A and M⁻¹Aᵀ: the normals in the metric of the mass matrix."""
         a = ode.constraint_jacobian(t, q, v)
         return a, mass_solve(ode.mass(q), a.T)
 
-    def along(self, ode: Any, normals: Any, x: Float[Array, " n"]) -> Float[Array, " c"]:
+    def along(self, ode: Mechanism, normals: Normals, x: Float[Array, " n"]) -> Float[Array, " c"]:
         """A x."""
         return matvec(normals[0], x)
 
-    def lift(self, ode: Any, normals: Any, mu: Float[Array, " c"]) -> Float[Array, " n"]:
+    def lift(self, ode: Mechanism, normals: Normals, mu: Float[Array, " c"]) -> Float[Array, " n"]:
         """M⁻¹Aᵀ μ, of the first constraints where μ is shorter."""
         return matvec(normals[1][:, : mu.shape[0]], mu)
 
-    def gram_solve(self, ode: Any, normals: Any, b: Float[Array, " c"]) -> Float[Array, " c"]:
+    def gram_solve(self, ode: Mechanism, normals: Normals, b: Float[Array, " c"]) -> Float[Array, " c"]:
         """x with A M⁻¹Aᵀ x = b, of the first constraints where b is shorter."""
         a, n = normals[0][: b.shape[0]], normals[1][:, : b.shape[0]]
         gram = _matmul(a, n)
@@ -59,7 +71,7 @@ class DenseNormals:
         rank = self.rank[b.shape[0] == self.holonomic + self.nonholonomic]
         return scale * semidefinite_solve(gram * scale[:, None] * scale, scale * b, rank)
 
-    def lengths(self, normals: Any) -> Float[Array, " c"]:
+    def lengths(self, normals: Normals) -> Float[Array, " c"]:
         """The length of each row of A."""
         return jnp.sqrt(jnp.sum(normals[0] ** 2, 1))
 
@@ -77,23 +89,25 @@ class SparseNormals:
     seeds: Float[np.ndarray, "colours n"]
     gram: Elimination
 
-    def at(self, ode: Any, t: Any, q: Any, v: Any) -> tuple[Any, Float[Array, " n"], Float[Array, "colours c"]]:
+    def at(
+        self, ode: Mechanism, t: Time, q: Flat, v: Flat
+    ) -> tuple[Any, Float[Array, " n"], Float[Array, "colours c"]]:
         """The point, and C there."""
         tangent = lambda seed: jax.jvp(functools.partial(ode.constraint, t), (q,), (seed,))[1]
         return jnp.asarray(t, q.dtype), q, jax.vmap(tangent)(jnp.asarray(self.seeds, q.dtype))
 
-    def along(self, ode: Any, normals: Any, x: Float[Array, " n"]) -> Float[Array, " c"]:
+    def along(self, ode: Mechanism, normals: Normals, x: Float[Array, " n"]) -> Float[Array, " c"]:
         """A x."""
         t, q, _ = normals
         return jax.jvp(functools.partial(ode.constraint, t), (q,), (x,))[1]
 
-    def lift(self, ode: Any, normals: Any, mu: Float[Array, " c"]) -> Float[Array, " n"]:
+    def lift(self, ode: Mechanism, normals: Normals, mu: Float[Array, " c"]) -> Float[Array, " n"]:
         """M⁻¹Aᵀ μ."""
         t, q, _ = normals
         _, transpose = jax.vjp(functools.partial(ode.constraint, t), q)
         return mass_solve(ode.mass(q), transpose(mu)[0])
 
-    def gram_solve(self, ode: Any, normals: Any, b: Float[Array, " c"]) -> Float[Array, " c"]:
+    def gram_solve(self, ode: Mechanism, normals: Normals, b: Float[Array, " c"]) -> Float[Array, " c"]:
         """x with A M⁻¹Aᵀ x = b."""
         _, q, compressed = normals
         mass = ode.mass(q)
@@ -106,7 +120,7 @@ class SparseNormals:
         couplings = jnp.sum(shared * at(weighted, rows) * at(compressed, columns), 0)
         return self.gram.solve(jnp.sum(weighted * compressed, 0), couplings, b)
 
-    def lengths(self, normals: Any) -> Float[Array, " c"]:
+    def lengths(self, normals: Normals) -> Float[Array, " c"]:
         """The length of each row of A."""
         return jnp.sqrt(jnp.sum(normals[2] ** 2, 0))
 
@@ -131,7 +145,7 @@ def _sparse_normals(pattern: bytes, shape: tuple[int, int]) -> SparseNormals:
     return SparseNormals(columns, seed_matrix(colours).T, elimination(gram @ gram.T > 0))
 
 
-def constraint_pattern(constraint: Any, t: Any, q: Any) -> Bool[np.ndarray, "c n"] | None:
+def constraint_pattern(constraint: Callable[[Time, Flat], Array], t: Time, q: Flat) -> Bool[np.ndarray, "c n"] | None:
     """Which constraint depends on which coordinate; `None` where that cannot be read off."""
     try:
         return dependence(lambda q: constraint(t, q), jax.ShapeDtypeStruct(q.shape, q.dtype), derivative=True)[0]

@@ -2,13 +2,13 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Inexact
 
 from ..compiler import Polynomial, polynomials
 from ..structure import (
@@ -22,6 +22,7 @@ from ..structure import (
     signature,
     variable_indices,
 )
+from ..types import DType, Flat, Scalar, Time
 from .taylor import total_derivatives
 
 
@@ -46,7 +47,7 @@ class Combination:
         """What F̄ₗ is made of."""
         return dict(self.rows).get(equation, ((equation, 0, 1.0),))
 
-    def of(self, levels: list[Float[Array, " n"]]) -> list[Float[Array, " n"]]:
+    def of(self, levels: list[Inexact[Array, "n *k"]]) -> list[Inexact[Array, "n *k"]]:
         """F̄, dF̄/dt, … of F, dF/dt, …: as many fewer as the degree."""
         if not self.rows:
             return levels
@@ -90,6 +91,7 @@ class Offsets:
         return jacobian_pattern(self.signature, self.sigma.equation_offsets, self.sigma.variable_offsets)
 
 
+@runtime_checkable
 class Form(Protocol):
     """What is asked of 0 = F(t, y, ẏ). `may_cancel`: whether highest derivatives may cancel between equations."""
 
@@ -101,10 +103,10 @@ class Form(Protocol):
     def variables(self) -> tuple[str, ...]: ...
     @property
     def may_cancel(self) -> bool: ...
-    def residual(self, t: Any, y: Any, yd: Any) -> Any: ...
+    def residual(self, t: Time, y: Flat, yd: Flat) -> Any: ...
 
 
-def find_offsets(form: Form, dtype: Any) -> Offsets:
+def find_offsets(form: Form, dtype: DType) -> Offsets:
     """The Σ-method, by the linear-combination method where it fails because terms cancel.
 
     Where u with constant entries makes uᵀ ∂F̄ᵢ/∂xⱼ^(dⱼ−cᵢ) = 0, one of the equations with the smallest offset c among those
@@ -174,14 +176,14 @@ def _combined(slopes: Callable[[int], _Polynomials | None], before: Offsets) -> 
 class Slopes:
     """∂F/∂y^(k), of dF/dt and so on up to a `degree`, along as few directions as tell them apart."""
 
-    def __init__(self, form: Form, found: Offsets, degree: int, dtype: Any) -> None:
+    def __init__(self, form: Form, found: Offsets, degree: int, dtype: DType) -> None:
         # A derivative of an equation has no variables but those of the equation.
         self.pattern = found.by_y | found.by_rate
         self.colours = column_colouring(self.pattern)
         self.form, self.degree, self.dtype = form, degree, dtype
         self.shape = (degree + 2, form.size)
 
-    def along(self, t: Any, orders: Float[Array, "orders n"]) -> Float[Array, "directions degree+1 n"]:
+    def along(self, t: Scalar, orders: Float[Array, "orders n"]) -> Float[Array, "directions levels n"]:
         """The directional derivatives at t and (y, ẏ, …)."""
         levels = lambda orders: jnp.stack(total_derivatives(self.form.residual, t, list(orders), self.degree + 1))
         directions = np.kron(np.eye(self.shape[0]), seed_matrix(self.colours).T).reshape(-1, *self.shape)
@@ -229,7 +231,7 @@ def _may_cancel(pattern: list[list[int]]) -> list[int]:
         left -= alone
 
 
-def _left_null_vectors(rows: list[Any]) -> list[dict[int, float]]:
+def _left_null_vectors(rows: Sequence[Mapping[tuple[int, Any], float]]) -> list[dict[int, float]]:
     """The combinations of rows, given as polynomials over their columns, that vanish; by elimination."""
     place: dict[Any, int] = {}
     for row in rows:

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..linalg import take
 from ..structure import dependence
+from ..types import DType, Time
 from .manifold_ode import at_one_instant
 from .structural_ode import StructuralODE
 
@@ -65,11 +66,11 @@ class Index1Form(eqx.Module):
         """Whether highest derivatives may cancel between equations."""
         return False
 
-    def encode(self, t: Any, y: Float[Array, " N"]) -> Float[Array, " z"]:
+    def encode(self, t: Time, y: Float[Array, " N"]) -> Float[Array, " z"]:
         """(Y, X)."""
         return jnp.concatenate([y, self.ode.highest(t, y)])
 
-    def decode(self, t: Any, z: Float[Array, " z"]) -> Any:
+    def decode(self, t: Time, z: Float[Array, " z"]) -> Any:
         """The state in the user's structure."""
         form = self.ode.form
         return form.decode(t, take(z, self.ode.orders.places[0][: form.layout.size]))
@@ -78,7 +79,7 @@ class Index1Form(eqx.Module):
         """What z itself says of ż: the rate of all of Y."""
         return jnp.concatenate([take(z, self.ode.orders.derivatives), jnp.zeros(self.ode.form.size, z.dtype)])
 
-    def with_all_candidates(self, dtype: Any) -> "Index1Form":
+    def with_all_candidates(self, dtype: DType) -> "Index1Form":
         """With every entry that may become a dummy derivative marked by a half, for structural analysis: whatever is
         selected, its equations depend on no more.
         """
@@ -95,7 +96,7 @@ class Index1Form(eqx.Module):
         return Index1Form(self.ode, jnp.asarray(np.reshape(rows, (len(rows), orders.size)), dtype))
 
     @at_one_instant
-    def residual(self, t: Any, z: Float[Array, " z"], zd: Float[Array, " z"]) -> Float[Array, " z"]:
+    def residual(self, t: Time, z: Float[Array, " z"], zd: Float[Array, " z"]) -> Float[Array, " z"]:
         """F(t, z, ż)."""
         orders = self.ode.orders
         y, x = z[: orders.size], z[orders.size :]

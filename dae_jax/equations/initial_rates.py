@@ -1,6 +1,6 @@
 """ẏ at the start of 0 = F(t, y, ẏ) where F is nonlinear in it."""
 
-from typing import Any
+from typing import Any, TypeGuard
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..linalg import solve
 from ..structure import is_linear
+from ..types import DType, Flat, IntScalar, Scalar, Time
 from .residual_form import ResidualForm
 
 
@@ -19,7 +20,7 @@ STEPS = 60
 APART = 1e-4
 
 
-def is_nonlinear(form: Any, dtype: Any) -> bool:
+def is_nonlinear(form: object, dtype: DType) -> TypeGuard[ResidualForm]:
     """Whether F depends on ẏ other than linearly."""
     if not isinstance(form, ResidualForm) or not form.may_be_nonlinear:
         return False
@@ -30,7 +31,7 @@ def is_nonlinear(form: Any, dtype: Any) -> bool:
         return False
 
 
-def rates_of(form: ResidualForm, t: Any, y: Float[Array, " n"]) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
+def rates_of(form: ResidualForm, t: Time, y: Float[Array, " n"]) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
     """ẏ with F(t, y, ẏ) = 0, or with the least F, by the Levenberg–Marquardt method from the form's guess; where the user
     gave none, from others also, and whether these led to different solutions.
 
@@ -52,12 +53,12 @@ def rates_of(form: ResidualForm, t: Any, y: Float[Array, " n"]) -> tuple[Float[A
     return jnp.where(jnp.max(slopes, 0) > 0, found[first], guess), several
 
 
-def _nearest(form: ResidualForm, t: Any, y: Any, start: Any) -> tuple[Float[Array, " n"], Float[Array, ""]]:
+def _nearest(form: ResidualForm, t: Time, y: Flat, start: Flat) -> tuple[Float[Array, " n"], Float[Array, ""]]:
     """Where F is least near a start, and its size there."""
     eye = jnp.eye(form.size, dtype=y.dtype)
     size = lambda r: jnp.sum(r * r)
 
-    def improve(_: Any, carry: Any) -> Any:
+    def improve(_: IntScalar, carry: tuple[Flat, Scalar]) -> Any:
         yd, damping = carry
         r, slopes = form.residual(t, y, yd), jax.jacfwd(form.residual, 2)(t, y, yd)
         normal = jnp.sum(slopes[:, :, None] * slopes[:, None, :], 0)

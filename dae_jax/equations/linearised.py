@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Inexact, Int
+from jaxtyping import Array, Bool, Float, Inexact, Int, PyTree
 
 from ..linalg.dense import LOOPED
 from ..linalg.storage import Banded, Dense, Storage
@@ -21,6 +21,7 @@ from ..structure import (
     sigma_method,
     signature,
 )
+from ..types import Flat, IntScalar, Scalar, Time
 from .derivative_orders import Combination, Offsets, find_offsets
 from .index1_form import Index1Form
 from .initial_rates import is_nonlinear, rates_of
@@ -98,36 +99,36 @@ class LinearisedResidual(eqx.Module):
         """How J and M are stored."""
         return self.structure.storage
 
-    def decode(self, t: Any, y: Float[Array, " n"]) -> Any:
+    def decode(self, t: Time, y: Float[Array, " n"]) -> Any:
         """The state in the user's structure."""
         return self.form.decode(t, y)
 
-    def residual(self, t: Any, y: Float[Array, " n"], yd: Float[Array, " n"]) -> Float[Array, " n"]:
+    def residual(self, t: Time, y: Float[Array, " n"], yd: Float[Array, " n"]) -> Float[Array, " n"]:
         """F(t, y, ẏ)."""
         return self.form.residual(t, y, yd)
 
-    def jacobians(self, t: Any, y: Float[Array, " n"], yd: Float[Array, " n"]) -> tuple[Array, Array]:
+    def jacobians(self, t: Time, y: Float[Array, " n"], yd: Float[Array, " n"]) -> tuple[Array, Array]:
         """J and M."""
         t = jnp.asarray(t, y.dtype)
         return self._by_y(t, y, yd), self._by_rate(t, y, yd)
 
     @at_one_instant
-    def _by_y(self, t: Any, y: Float[Array, " n"], yd: Float[Array, " n"]) -> Array:
+    def _by_y(self, t: Scalar, y: Float[Array, " n"], yd: Float[Array, " n"]) -> Array:
         return self._by(1, self.structure.by_y, t, y, yd)
 
     @at_one_instant
-    def _by_rate(self, t: Any, y: Float[Array, " n"], yd: Float[Array, " n"]) -> Array:
+    def _by_rate(self, t: Scalar, y: Float[Array, " n"], yd: Float[Array, " n"]) -> Array:
         return self._by(2, self.structure.by_rate, t, y, yd)
 
-    def _by(self, argument: int, compression: Compression | None, *point: Any) -> Array:
+    def _by(self, argument: int, compression: Compression | None, *point: Array) -> Array:
         """The stored entries of the derivative of F(t, y, ẏ) by one of its arguments."""
         if compression is None:
             return jax.jacfwd(self.form.residual, argument)(*point)
-        of = lambda x: self.residual(*point[:argument], x, *point[argument + 1 :])
+        of = lambda x: self.residual(*(x if k == argument else given for k, given in enumerate(point)))
         along = lambda seed: jax.jvp(of, (point[argument],), (seed,))[1]
         return compression.entries(jax.vmap(along)(jnp.asarray(compression.seeds, point[1].dtype)))
 
-    def factor(self, j: Array, m: Array, c: Any, h: Any) -> tuple[Any, Float[Array, ""]]:
+    def factor(self, j: Array, m: Array, c: Inexact[Array, ""], h: Time) -> tuple[Any, Float[Array, ""]]:
         """The factors of J + c M, for c of the order of 1/h, and the smallest pivot, of round-off size for a singular one.
 
         With column j scaled by h^dⱼ, the rows tend with h → 0 to those of the Σ-method's system Jacobian, however high the
@@ -138,25 +139,25 @@ class LinearisedResidual(eqx.Module):
         factors, smallest = self.storage.factor(matrix)
         return (factors, scale, c), smallest
 
-    def round_off(self, j: Array, m: Array, c: Any, size: Float[Array, " n"]) -> Float[Array, " n"]:
+    def round_off(self, j: Array, m: Array, c: Inexact[Array, ""], size: Float[Array, " n"]) -> Float[Array, " n"]:
         """The round-off of each equation, (|J| + |c M|) ε, for variables of that `size`."""
         return self.storage.apply(jnp.abs(j) + jnp.abs(c * m), size) * jnp.finfo(size.dtype).eps
 
-    def column_scale(self, h: Any) -> Float[Array, " n"]:
+    def column_scale(self, h: Time) -> Float[Array, " n"]:
         """h^dⱼ."""
         return powers(jnp.minimum(jnp.abs(h), 1), self.structure.offsets)
 
-    def solve(self, factors: Any, b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
+    def solve(self, factors: PyTree, b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
         """x with (J + c M) x = b."""
         inner, scale, c = factors
         return scale * self.storage.solve(inner, self._combined(b, c))
 
-    def _combined(self, rows: Any, c: Any) -> Any:
+    def _combined(self, rows: Array, c: Inexact[Array, ""]) -> Any:
         """Rows, or right-hand sides, in the combination in which highest derivatives do not cancel, with c for d/dt."""
         combination = self.structure.combination
         return combination.of([rows * c**k if k else rows for k in range(combination.degree + 1)])[0]
 
-    def rates(self, t: Any, y: Float[Array, " n"]) -> Float[Array, " n"]:
+    def rates(self, t: Time, y: Float[Array, " n"]) -> Float[Array, " n"]:
         """ẏ with F(t, y, ẏ) = 0 where y is consistent, else with the least F; for variables whose derivative does not occur
         what the form knows. Gauss–Newton's method, or a search where F is nonlinear in ẏ.
         """
@@ -164,16 +165,16 @@ class LinearisedResidual(eqx.Module):
         if is_nonlinear(self.form, y.dtype):
             return rates_of(self.form, t, y)[0]
 
-        def improve(_: Any, yd: Any) -> Any:
+        def improve(_: IntScalar, yd: Flat) -> Any:
             return yd - self.storage.least_squares(self._by_rate(t, y, yd), self.residual(t, y, yd))
 
         return jax.lax.fori_loop(0, GAUSS_NEWTON, improve, self.form.known_rates(y))
 
-    def starting(self, t: Any, y: Float[Array, " n"]) -> "LinearisedResidual":
+    def starting(self, t: Time, y: Float[Array, " n"]) -> "LinearisedResidual":
         """For a solve from (t, y)."""
         return dataclasses.replace(self, start=jax.lax.stop_gradient(self.rates(t, y)))
 
-    def weights(self, h: Any, raised: Any = 1.0) -> Float[Array, " n"]:
+    def weights(self, h: Time, raised: Time = 1.0) -> Float[Array, " n"]:
         """h^(k−1) for a variable of index k > 1: how much of its error counts; up to `raised` times that, or h^(k−2), for those
         that the user sees.
 
@@ -230,7 +231,7 @@ def _outline(
         storage,
         indices,
         offsets,
-        by_rate.any(0),
+        np.asarray(by_rate.any(0)),
         hidden,
         combination if isinstance(storage, Dense) else Combination(),
         None if small else _compression(by_y, storage),

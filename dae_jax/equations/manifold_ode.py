@@ -6,21 +6,36 @@ and their hidden derivatives.
 
 import abc
 import functools
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Hashable
+from typing import Any, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 import equinox as eqx
 import jax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from ..compiler import scalarise, subroutine
+from ..types import State, Time, TreeDef, Y
 
 
-def at_one_instant(method: Callable[..., Any]) -> Callable[..., Any]:
+_T = TypeVar("_T")
+# The constraints' linearisation at a point, in the form that its equations keep it in.
+Normals: TypeAlias = Array | tuple[Array, ...]
+# What is added to the highest derivative of a constraint, of the constraint and its lower derivatives.
+Feedback: TypeAlias = Callable[..., Array]
+
+
+@runtime_checkable
+class Equations(Protocol):
+    """What the solver gets as diffrax's `args`: a system at one instant, which knows the user's structure."""
+
+    def decode(self, t: Time, y: Y) -> State: ...
+
+
+def at_one_instant(method: Callable[..., _T]) -> Callable[..., _T]:
     """Runs a method of an `eqx.Module` as scalar arithmetic where it is small, traced once for all its call sites."""
 
     @functools.wraps(method)
-    def wrapped(*args: Any) -> Any:
+    def wrapped(*args: PyTree) -> Any:
         arrays, static = eqx.partition(args, eqx.is_array)
         leaves, treedef = jax.tree.flatten(static)
         return _evaluate(method, tuple(leaves), treedef, arrays)
@@ -29,7 +44,7 @@ def at_one_instant(method: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @functools.partial(subroutine, static_argnums=(0, 1, 2))
-def _evaluate(method: Callable[..., Any], leaves: tuple[Any, ...], treedef: Any, arrays: Any) -> Any:
+def _evaluate(method: Callable[..., Any], leaves: tuple[Hashable, ...], treedef: TreeDef, arrays: PyTree) -> Any:
     static = jax.tree.unflatten(treedef, leaves)
     return scalarise(lambda arrays: method(*eqx.combine(arrays, static)))(arrays)
 
@@ -42,35 +57,35 @@ class ManifoldODE(eqx.Module):
     """
 
     @abc.abstractmethod
-    def field(self, t: Any, y: Any, feedback: Any = None) -> Any:
+    def field(self, t: Time, y: Y, feedback: Feedback | None = None) -> Any:
         """The underlying ODE at (t, y). `feedback`, a function of H and its derivatives level by level, is added to the
         highest derivative of each constraint, which is 0 otherwise (see `Baumgarte`).
         """
 
     @abc.abstractmethod
-    def invariants(self, t: Any, y: Any) -> tuple[Float[Array, " levels"], ...]:
+    def invariants(self, t: Time, y: Y) -> tuple[Float[Array, " levels"], ...]:
         """H(t, y), level by level: the constraints, then their hidden derivatives."""
 
     @abc.abstractmethod
-    def normals(self, t: Any, y: Any) -> Any:
+    def normals(self, t: Time, y: Y) -> Any:
         """Directions that span a complement of the manifold's tangent space at (t, y), and what is needed to use them."""
 
     @abc.abstractmethod
-    def displace(self, y: Any, normals: Any, mu: Any) -> Any:
+    def displace(self, y: Y, normals: Normals, mu: Float[Array, " c"]) -> Any:
         """y + N μ, with the normals N and a flat vector μ."""
 
     @abc.abstractmethod
-    def retract_along(self, t: Any, y: Any, normals: Any) -> tuple[Any, Bool[Array, ""]]:
+    def retract_along(self, t: Time, y: Y, normals: Normals) -> tuple[Any, Bool[Array, ""]]:
         """The point y + N μ on the manifold at time t, and whether it was found."""
 
-    def project(self, t: Any, y: Any) -> tuple[Any, Bool[Array, ""]]:
+    def project(self, t: Time, y: Y) -> tuple[Any, Bool[Array, ""]]:
         """The nearest point on the manifold at time t, with the normals at y itself, and whether it was found."""
         return self.retract_along(t, y, self.normals(t, y))
 
     @abc.abstractmethod
-    def tangent(self, dy: Any, normals: Any) -> Any:
+    def tangent(self, dy: Y, normals: Normals) -> Any:
         """The part of a derivative ẏ in the tangent space to which `normals` are normal."""
 
     @abc.abstractmethod
-    def decode(self, t: Any, y: Any) -> Any:
+    def decode(self, t: Time, y: Y) -> Any:
         """The state in the user's structure."""

@@ -2,18 +2,19 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from ..linalg import fixed_point, implicit_root, relative_change, solve
 from ..structure.layout import Layout
 from ..systems import ConstrainedSystem
+from ..types import Args, DType, Flat, Phase, State, Time
 from .constraint_jacobian import (
     SPARSE_FROM,
     DenseNormals,
@@ -25,10 +26,10 @@ from .constraint_jacobian import (
     sparse_normals,
     unit_diagonal,
 )
-from .manifold_ode import ManifoldODE, at_one_instant
+from .manifold_ode import Feedback, ManifoldODE, Normals, at_one_instant
 
 
-def allowed_contradiction(dtype: Any) -> float:
+def allowed_contradiction(dtype: DType) -> float:
     """The part of the accelerations that dependent constraints ask for in which they may disagree."""
     return max(1e-6, float(jnp.finfo(dtype).eps) ** 0.5)
 
@@ -51,7 +52,7 @@ class MechanicalODE(ManifoldODE):
 
     @classmethod
     def of(
-        cls, system: ConstrainedSystem, t: Any, state: Any, args: Any, rank: int | Rank | None = None
+        cls, system: ConstrainedSystem, t: Time, state: State, args: Args, rank: int | Rank | None = None
     ) -> "MechanicalODE":
         """Finds, while tracing, what the system has and has not; `state` = (q, v) gives shapes and types only."""
         q, v = state
@@ -67,7 +68,7 @@ class MechanicalODE(ManifoldODE):
         sparse = ode._sparse(t, layout.flatten(q)) if h == 0 and g >= SPARSE_FROM and rank is None else None
         return ode if sparse is None else dataclasses.replace(ode, linear=sparse)
 
-    def _sparse(self, t: Any, q: Any) -> SparseNormals | None:
+    def _sparse(self, t: Time, q: Flat) -> SparseNormals | None:
         mass = jax.eval_shape(self.mass, q)
         pattern = constraint_pattern(self.constraint, t, q) if mass is None or mass.ndim < 2 else None
         return None if pattern is None else sparse_normals(pattern)
@@ -77,18 +78,18 @@ class MechanicalODE(ManifoldODE):
         """How many constraints are independent, where some are redundant: of the holonomic ones, and of all."""
         return self.linear.rank if isinstance(self.linear, DenseNormals) else None
 
-    def decode(self, t: Any, y: Any) -> Any:
+    def decode(self, t: Time, y: Phase) -> Any:
         q, v = y
         return self.layout.unflatten(q), self.layout.unflatten(v)
 
-    def encode(self, state: Any) -> Any:
+    def encode(self, state: State) -> Any:
         """The flat vectors (q, v)."""
         q, v = state
         return self.layout.flatten(q), self.layout.flatten(v)
 
     # The system's functions on flat vectors
 
-    def force(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
+    def force(self, t: Time, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
         """f(t, q, v)."""
         flat = self.layout.unflatten
         return self.layout.flatten(self.system.force(t, flat(q), flat(v), self.args)).astype(q.dtype)
@@ -109,33 +110,35 @@ class MechanicalODE(ManifoldODE):
         off = jnp.max(jnp.abs(sizes - sizes.T)) <= jnp.finfo(q.dtype).eps ** 0.75 * jnp.max(jnp.abs(sizes))
         return jnp.where(off, mass, jnp.nan)
 
-    def constraint(self, t: Any, q: Float[Array, " n"]) -> Float[Array, " m"]:
+    def constraint(self, t: Time, q: Float[Array, " n"]) -> Float[Array, " m"]:
         """g(t, q)."""
         if self.system.constraint is None:
             return jnp.zeros(0, q.dtype)
         return jnp.ravel(self.system.constraint(t, self.layout.unflatten(q), self.args)).astype(q.dtype)
 
-    def velocity_constraint(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " mp"]:
+    def velocity_constraint(self, t: Time, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " mp"]:
         """(ġ, h) = (G v + g_t, h(t, q, v))."""
         _, velocity = self._along(self.constraint, self.depends_on_time[0], t, (q,), (v,))
         if self.system.nonholonomic is None:
             return velocity
         return jnp.concatenate([velocity, self._nonholonomic(t, q, v)])
 
-    def _nonholonomic(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " p"]:
+    def _nonholonomic(self, t: Time, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " p"]:
         assert self.system.nonholonomic is not None
         flat = self.layout.unflatten
         return jnp.ravel(self.system.nonholonomic(t, flat(q), flat(v), self.args)).astype(q.dtype)
 
     @staticmethod
-    def _along(function: Callable[..., Any], uses_time: bool, t: Any, at: Any, direction: Any) -> Any:
+    def _along(
+        function: Callable[..., Any], uses_time: bool, t: Time, at: tuple[Flat, ...], direction: tuple[Flat, ...]
+    ) -> Any:
         """`function(t, *at)` and its derivative along (1, *direction); along (0, *direction) if it does not use time."""
         if uses_time:
             t = jnp.asarray(t, at[0].dtype)
             return jax.jvp(function, (t, *at), (jnp.ones_like(t), *direction))
         return jax.jvp(functools.partial(function, t), at, direction)
 
-    def constraint_jacobian(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, "mp n"]:
+    def constraint_jacobian(self, t: Time, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, "mp n"]:
         """A = [G; ∂h/∂v]."""
         rows = []
         if self.holonomic:
@@ -144,7 +147,7 @@ class MechanicalODE(ManifoldODE):
             rows.append(jax.jacfwd(self._nonholonomic, 2)(t, q, v))
         return jnp.concatenate(rows) if len(rows) > 1 else rows[0]
 
-    def bias(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " mp"]:
+    def bias(self, t: Time, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " mp"]:
         """γ, the second derivative of g and the first of h where v̇ = 0."""
         uses_time = self.depends_on_time[0] or self.depends_on_time[1]
         _, bias = self._along(lambda t, q: self.velocity_constraint(t, q, v), uses_time, t, (q,), (v,))
@@ -153,16 +156,18 @@ class MechanicalODE(ManifoldODE):
     # The underlying ODE
 
     @at_one_instant
-    def field(self, t: Any, y: Any, feedback: Any = None) -> Any:
+    def field(self, t: Time, y: Phase, feedback: Feedback | None = None) -> Any:
         q, v = y
         return v, self._accelerations(t, q, v, feedback)[0]
 
     @at_one_instant
-    def multipliers(self, t: Any, y: Any) -> Float[Array, " mp"]:
+    def multipliers(self, t: Time, y: Phase) -> Float[Array, " mp"]:
         """(λ, μ), of least norm where constraints are redundant."""
         return self._accelerations(t, *y, None)[1]
 
-    def _accelerations(self, t: Any, q: Any, v: Any, feedback: Any) -> tuple[Float[Array, " n"], Float[Array, " mp"]]:
+    def _accelerations(
+        self, t: Time, q: Flat, v: Flat, feedback: Feedback | None
+    ) -> tuple[Float[Array, " n"], Float[Array, " mp"]]:
         normals = self.normals(t, (q, v))
         free = mass_solve(self.mass(q), self.force(t, q, v))
         target = self.bias(t, q, v)
@@ -175,7 +180,9 @@ class MechanicalODE(ManifoldODE):
             pulled = self._unless_contradictory(t, (q, v), normals, target, pulled)
         return free - pulled, multipliers
 
-    def _unless_contradictory(self, t: Any, y: Any, normals: Any, target: Any, pulled: Any) -> Any:
+    def _unless_contradictory(
+        self, t: Time, y: Phase, normals: Normals, target: Float[Array, " c"], pulled: Flat
+    ) -> Any:
         """x = M⁻¹Aᵀλ, or NaN where it leaves more of A x = b than y is off the constraints: dependent ones disagree."""
         lengths = self.linear.lengths(normals)
         lengths = jnp.where(lengths > 0, lengths, 1)
@@ -184,7 +191,7 @@ class MechanicalODE(ManifoldODE):
         allowed = (allowed_contradiction(drift.dtype) + 10 * drift) * (1 + jnp.max(jnp.abs(target) / lengths))
         return jnp.where(off <= allowed, pulled, jnp.nan)
 
-    def _feedback(self, t: Any, q: Any, v: Any, feedback: Any) -> Float[Array, " mp"]:
+    def _feedback(self, t: Time, q: Flat, v: Flat, feedback: Feedback) -> Float[Array, " mp"]:
         velocity = self.velocity_constraint(t, q, v)
         terms = []
         if self.holonomic:
@@ -196,7 +203,7 @@ class MechanicalODE(ManifoldODE):
     # The manifold
 
     @at_one_instant
-    def distances(self, t: Any, y: Any) -> tuple[Float[Array, " m"], Float[Array, " mp"]]:
+    def distances(self, t: Time, y: Phase) -> tuple[Float[Array, " m"], Float[Array, " mp"]]:
         """The invariants divided by the length of each constraint's gradient: about how far y is from satisfying them."""
         lengths = self.linear.lengths(self.normals(t, y))
         lengths = jnp.where(lengths > 0, lengths, 1)
@@ -204,46 +211,46 @@ class MechanicalODE(ManifoldODE):
         return jnp.abs(g) / lengths[: self.holonomic], jnp.abs(velocity) / lengths
 
     @at_one_instant
-    def invariants(self, t: Any, y: Any) -> tuple[Float[Array, " m"], Float[Array, " mp"]]:
+    def invariants(self, t: Time, y: Phase) -> tuple[Float[Array, " m"], Float[Array, " mp"]]:
         q, v = y
         return self.constraint(t, q), self.velocity_constraint(t, q, v)
 
     @at_one_instant
-    def normals(self, t: Any, y: Any) -> Any:
+    def normals(self, t: Time, y: Phase) -> Any:
         """The constraints' linearisation, as `normals.DenseNormals` and `normals.SparseNormals` have it."""
         return self.linear.at(self, t, *y)
 
     @at_one_instant
-    def tangent(self, dy: Any, normals: Any) -> Any:
+    def tangent(self, dy: Phase, normals: Normals) -> Any:
         dq, dv = dy
         return self._tangent(normals, dq, self.holonomic), self._tangent(normals, dv, None)
 
-    def _tangent(self, normals: Any, x: Float[Array, " n"], rows: int | None) -> Float[Array, " n"]:
+    def _tangent(self, normals: Normals, x: Float[Array, " n"], rows: int | None) -> Float[Array, " n"]:
         off = self.linear.along(self, normals, x)[:rows]
         return x - self.linear.lift(self, normals, self.linear.gram_solve(self, normals, off)) if off.size else x
 
-    def displace(self, y: Any, normals: Any, mu: Float[Array, " c"]) -> Any:
+    def displace(self, y: Phase, normals: Normals, mu: Float[Array, " c"]) -> Any:
         q, v = y
         m = self.holonomic
         return q + self.linear.lift(self, normals, mu[:m]), v + self.linear.lift(self, normals, mu[m:])
 
-    def retract_along(self, t: Any, y: Any, normals: Any) -> tuple[Any, Bool[Array, ""]]:
+    def retract_along(self, t: Time, y: Phase, normals: Normals) -> tuple[Any, Bool[Array, ""]]:
         q, _ = y
         zero = jnp.zeros(2 * self.holonomic + self.nonholonomic, q.dtype)
         return self._restored(t, y, normals, self.correction(t, y, normals, zero))
 
-    def project(self, t: Any, y: Any) -> tuple[Any, Bool[Array, ""]]:
+    def project(self, t: Time, y: Phase) -> tuple[Any, Bool[Array, ""]]:
         normals, *first = self._first_correction(t, y)
         return self._restored(t, y, normals, first)
 
     @at_one_instant
-    def _first_correction(self, t: Any, y: Any) -> tuple[Any, Float[Array, " c"], Float[Array, ""]]:
+    def _first_correction(self, t: Time, y: Phase) -> tuple[Any, Float[Array, " c"], Float[Array, ""]]:
         normals = self.normals(t, y)
         zero = jnp.zeros(2 * self.holonomic + self.nonholonomic, y[0].dtype)
         return normals, *self.correction(t, y, normals, zero)
 
-    def _restored(self, t: Any, y: Any, normals: Any, first: Any) -> tuple[Any, Bool[Array, ""]]:
-        def iterate(params: Any) -> tuple[Float[Array, " c"], Bool[Array, ""]]:
+    def _restored(self, t: Time, y: Phase, normals: Normals, first: Sequence[Array]) -> tuple[Any, Bool[Array, ""]]:
+        def iterate(params: PyTree) -> tuple[Float[Array, " c"], Bool[Array, ""]]:
             *point, first = params
             return fixed_point(lambda mu: MechanicalODE.correction(*point, mu), *first)
 
@@ -253,14 +260,14 @@ class MechanicalODE(ManifoldODE):
         displaced = self.displace(y, normals, mu)
         return displaced, found if self.rank is None else found & self._all_hold(t, displaced)
 
-    def _all_hold(self, t: Any, y: Any) -> Bool[Array, ""]:
+    def _all_hold(self, t: Time, y: Phase) -> Bool[Array, ""]:
         """Whether the constraints hold that depend on others: Newton's corrections ask for as many as are independent."""
         root = jnp.finfo(y[0].dtype).eps ** 0.5
         near = [jnp.all(d <= root * (1 + jnp.max(jnp.abs(x)))) for d, x in zip(self.distances(t, y), y, strict=True)]
         return near[0] & near[1]
 
     @at_one_instant
-    def correction(self, t: Any, y: Any, normals: Any, mu: Float[Array, " c"]) -> tuple[Float[Array, " c"], Any]:
+    def correction(self, t: Time, y: Phase, normals: Normals, mu: Float[Array, " c"]) -> tuple[Float[Array, " c"], Any]:
         """One Newton correction of μ in H(t, y + N μ) = 0, and its size: positions first, then the velocities at them.
 
         The matrix is A M⁻¹Aᵀ at the current point, which differs from the Jacobian A N by the square of the angle
@@ -277,7 +284,7 @@ class MechanicalODE(ManifoldODE):
         return mu - jnp.concatenate([delta, kappa]), jnp.maximum(*sizes)
 
 
-def _manifold_residual(mu: Float[Array, " c"], params: Any) -> Float[Array, " c"]:
+def _manifold_residual(mu: Float[Array, " c"], params: PyTree) -> Float[Array, " c"]:
     ode, t, y, normals, _ = params
     return jnp.concatenate(ode.invariants(t, ode.displace(y, normals, mu)))
 
@@ -290,7 +297,7 @@ def _minimum_norm(a: Float[Array, "c c"], b: Float[Array, " c"]) -> Float[Array,
     return scale * matvec(inverse, scale * b)
 
 
-def _outline(function: Callable[..., Any] | None, *args: Any) -> tuple[int, bool]:
+def _outline(function: Callable[..., Any] | None, *args: PyTree) -> tuple[int, bool]:
     """How many numbers `function` returns, and whether it uses its first argument, time."""
     if function is None:
         return 0, False

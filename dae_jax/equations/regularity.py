@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..linalg import smallest_pivot
+from ..types import IntScalar, Phase, Time
 from .constraint_jacobian import Rank, SparseNormals, matvec
 from .mechanical import MechanicalODE, allowed_contradiction
 
@@ -78,7 +79,7 @@ class Redundancy(eqx.Module):
     zero: Bool[Array, " mp"]
 
 
-def redundancy(ode: MechanicalODE, t: Any, y: Any) -> Redundancy:
+def redundancy(ode: MechanicalODE, t: Time, y: Phase) -> Redundancy:
     """Whether constraints depend on each other at the flat state y = (q, v)."""
     m = ode.holonomic
     a, scale = _unit_rows(ode, t, y)
@@ -92,7 +93,7 @@ def redundancy(ode: MechanicalODE, t: Any, y: Any) -> Redundancy:
     return Redundancy(holonomic, jnp.sum(independent), values[0], contradiction, agree, jnp.all(a == 0, 1))
 
 
-def weakest(ode: MechanicalODE, t: Any, y: Any) -> Float[Array, ""]:
+def weakest(ode: MechanicalODE, t: Time, y: Phase) -> Float[Array, ""]:
     """The smallest pivot of A Aᵀ for rows of length 1: of round-off size where constraints depend on each other."""
     if isinstance(ode.linear, SparseNormals):
         ones = jnp.ones(ode.holonomic, y[0].dtype)
@@ -102,7 +103,7 @@ def weakest(ode: MechanicalODE, t: Any, y: Any) -> Float[Array, ""]:
     return smallest_pivot(jnp.sum(a[:, None] * a, -1))
 
 
-def _unit_rows(ode: MechanicalODE, t: Any, y: Any) -> tuple[Float[Array, "mp n"], Float[Array, " mp"]]:
+def _unit_rows(ode: MechanicalODE, t: Time, y: Phase) -> tuple[Float[Array, "mp n"], Float[Array, " mp"]]:
     """A with rows of length 1, and what they were multiplied by; rows of zeros as they are."""
     a = ode.constraint_jacobian(t, *y)
     lengths = jnp.sqrt(jnp.sum(a * a, 1))
@@ -110,7 +111,9 @@ def _unit_rows(ode: MechanicalODE, t: Any, y: Any) -> tuple[Float[Array, "mp n"]
     return a * scale[:, None], scale
 
 
-def _agree_nearby(ode: MechanicalODE, t: Any, y: Any, holonomic: Any, rank: Any) -> Bool[Array, ""]:
+def _agree_nearby(
+    ode: MechanicalODE, t: Time, y: Phase, holonomic: IntScalar | int, rank: IntScalar | int
+) -> Bool[Array, ""]:
     """Whether all constraints hold where the state has moved along the manifold of as many of them."""
     m, (q, v) = ode.holonomic, y
     eps = jnp.finfo(q.dtype).eps
@@ -118,13 +121,13 @@ def _agree_nearby(ode: MechanicalODE, t: Any, y: Any, holonomic: Any, rank: Any)
     rng = np.random.default_rng(0)
     away = lambda x: step * (1 + jnp.max(jnp.abs(x))) * jnp.asarray(rng.uniform(-1, 1, x.shape), x.dtype)
 
-    def nearest(a: Any, off: Any, rank: Any) -> Any:
+    def nearest(a: Float[Array, "c n"], off: Float[Array, " c"], rank: IntScalar | int) -> Any:
         """The shortest x with A x = off in `rank` directions."""
         values, vectors = jnp.linalg.eigh(a @ a.T)
         kept = jnp.arange(len(values)) >= len(values) - rank
         return a.T @ (vectors @ jnp.where(kept, vectors.T @ off / jnp.where(kept, values, 1), 0))
 
-    def corrected(_: Any, y: Any) -> Any:
+    def corrected(_: IntScalar, y: Phase) -> Any:
         q, v = y
         a, scale = _unit_rows(ode, t, (q, v))
         if m:
@@ -185,7 +188,7 @@ def rank_of(ode: MechanicalODE, found: Redundancy) -> Rank | None:
     return (int(found.holonomic), int(found.all)) if redundant else None
 
 
-def has_rank(ode: MechanicalODE, t: Any, y: Any, rank: Rank | None) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+def has_rank(ode: MechanicalODE, t: Time, y: Phase, rank: Rank | None) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
     """Whether the constraints have the given rank (`None`: all are independent): to working accuracy, and beyond doubt."""
     if rank is None:
         least, eps = weakest(ode, t, y), jnp.finfo(y[0].dtype).eps
@@ -198,11 +201,11 @@ def has_rank(ode: MechanicalODE, t: Any, y: Any, rank: Rank | None) -> tuple[Boo
 
 def is_near_constraints(
     ode: MechanicalODE,
-    t: Any,
-    start: Any,
-    end: Any,
+    t: Time,
+    start: Phase,
+    end: Phase,
     keeps: tuple[bool, bool],
-    tolerances: tuple[Any, Any],
+    tolerances: tuple[Time, Time],
     residual: bool,
 ) -> Bool[Array, ""]:
     """Whether a flat state at the end of a solve satisfies g and (ġ, h).
@@ -227,7 +230,7 @@ def is_near_constraints(
     return near & _redundant_agree(ode, t, end, root)
 
 
-def _redundant_agree(ode: MechanicalODE, t: Any, y: Any, root: Any) -> Bool[Array, ""]:
+def _redundant_agree(ode: MechanicalODE, t: Time, y: Phase, root: float | np.floating) -> Bool[Array, ""]:
     """Whether constraints that depend on others are off as these are: by what they have in common, not by a difference."""
     if ode.rank is None:
         return jnp.asarray(True)

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from ..linalg import take
 from ..systems import System
+from ..types import Args, IntScalar, State, Time
 from .linearised import LinearisedResidual
 from .residual_form import ResidualForm
 from .structural_ode import StructuralODE
@@ -26,7 +27,7 @@ class EquationDrift(NamedTuple):
     levels: tuple[Float[Array, " times"], ...]
 
 
-def equation_drift(system: System, t: Any, state: Any, args: Any) -> tuple[Float[Array, ""], ...]:
+def equation_drift(system: System, t: Time, state: State, args: Args) -> tuple[Float[Array, ""], ...]:
     """max |dᵏF/dtᵏ|, level by level, for the derivatives of y with which F = 0 holds best, and of these the ones with which
     dF/dt = 0 does, and so on: what is left of a level is what y itself violates.
     """
@@ -40,14 +41,14 @@ def equation_drift(system: System, t: Any, state: Any, args: Any) -> tuple[Float
     return tuple(jnp.max(jnp.abs(level)) for level in ode.invariants(t, _with_derivatives(ode, t, y)))
 
 
-def _with_derivatives(ode: StructuralODE, t: Any, y: Float[Array, " n"]) -> Float[Array, " N"]:
+def _with_derivatives(ode: StructuralODE, t: Time, y: Float[Array, " n"]) -> Float[Array, " N"]:
     """The state of the underlying ODE whose values are y."""
     free = np.flatnonzero(ode.orders.values < 0)
     state = take(y, ode.orders.values)
     if not free.size:
         return state
 
-    def correct(_: Any, state: Any) -> Any:
+    def correct(_: IntScalar, state: Float[Array, " N"]) -> Any:
         slopes, levels = ode.normals(t, state)[:, free], ode.invariants(t, state)
         step, open_directions, first = jnp.zeros(free.size, y.dtype), jnp.eye(free.size, dtype=y.dtype), 0
         for level in levels:

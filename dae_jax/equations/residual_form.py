@@ -7,11 +7,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from ..linalg import row_products, solve
 from ..structure.layout import Layout
 from ..systems import SemiExplicitDAE, System, is_implicit, is_mechanism
+from ..types import Args, DType, Phase, State, Time
 from .manifold_ode import at_one_instant
 from .mechanical import MechanicalODE
 
@@ -43,7 +44,7 @@ class ResidualForm(eqx.Module):
     units: Float[Array, " extra"] | None = None
 
     @classmethod
-    def of(cls, system: System, t: Any, state: Any, args: Any, form: Form = "index-3") -> "ResidualForm":
+    def of(cls, system: System, t: Time, state: State, args: Args, form: Form = "index-3") -> "ResidualForm":
         """The residual of `system`; `state` gives shapes only."""
         layout = Layout.of(state)
         if is_mechanism(system):
@@ -101,7 +102,7 @@ class ResidualForm(eqx.Module):
         multipliers = [f"multiplier[{i}]" for i in range(self.extra)]
         return (*names, *multipliers)
 
-    def at_start(self, t: Any, state: Any) -> tuple["ResidualForm", Float[Array, " n"]]:
+    def at_start(self, t: Time, state: State) -> tuple["ResidualForm", Float[Array, " n"]]:
         """The form in units of a mechanism's own, and the flat vector of a state with its multipliers.
 
         The unit of a multiplier is the mass in the direction of its constraint, aᵀ M a / aᵀ a, over the length of a: then
@@ -123,12 +124,12 @@ class ResidualForm(eqx.Module):
         rest = jnp.zeros(self.extra - multipliers.size, a.dtype)
         return form, jnp.concatenate([self.layout.flatten(state), multipliers, rest])
 
-    def encode(self, state: Any) -> Float[Array, " n"]:
+    def encode(self, state: State) -> Float[Array, " n"]:
         """The flat vector of a state, multipliers 0."""
         y = self.layout.flatten(state)
         return jnp.concatenate([y, jnp.zeros(self.extra, y.dtype)]) if self.extra else y
 
-    def decode(self, t: Any, y: Float[Array, " n"]) -> Any:
+    def decode(self, t: Time, y: Float[Array, " n"]) -> Any:
         """The state in the user's structure."""
         return self.layout.unflatten(y[: self.layout.size])
 
@@ -149,7 +150,7 @@ class ResidualForm(eqx.Module):
         return jnp.zeros_like(y)
 
     @at_one_instant
-    def residual(self, t: Any, y: Float[Array, " n"], yd: Float[Array, " n"]) -> Float[Array, " n"]:
+    def residual(self, t: Time, y: Float[Array, " n"], yd: Float[Array, " n"]) -> Float[Array, " n"]:
         """F(t, y, ẏ)."""
         system = self.system
         if is_mechanism(system):
@@ -161,7 +162,7 @@ class ResidualForm(eqx.Module):
         f = system.f(t, x, z, self.args)
         return jnp.concatenate([_flat(xd, y.dtype) - _flat(f, y.dtype), _flat(system.g(t, x, z, self.args), y.dtype)])
 
-    def _mechanical(self, t: Any, y: Float[Array, " n"], yd: Float[Array, " n"]) -> Float[Array, " n"]:
+    def _mechanical(self, t: Time, y: Float[Array, " n"], yd: Float[Array, " n"]) -> Float[Array, " n"]:
         assert is_mechanism(self.system)
         ode = MechanicalODE.of(self.system, t, self.layout.unflatten(y[: self.layout.size]), self.args)
         n, m, p = ode.layout.size, ode.holonomic, ode.nonholonomic
@@ -188,7 +189,14 @@ def _weighted(mass: Float[Array, "..."] | None, x: Float[Array, "n *k"]) -> Floa
     return jnp.sum(mass * x, 1) if x.ndim < 2 else row_products(mass, x.T)
 
 
-def _multipliers(ode: MechanicalODE, t: Any, y: Any, a: Any, mass: Any, units: Any) -> Float[Array, " c"]:
+def _multipliers(
+    ode: MechanicalODE,
+    t: Time,
+    y: Phase,
+    a: Float[Array, "c n"],
+    mass: Float[Array, "..."] | None,
+    units: Float[Array, " c"],
+) -> Float[Array, " c"]:
     """λ at a state, in its `units`, from M v̇ + Aᵀλ = f and A v̇ = −γ: M may be singular."""
     n, c = ode.layout.size, len(a)
     if mass is None or n + c > BORDERED:
@@ -201,11 +209,11 @@ def _multipliers(ode: MechanicalODE, t: Any, y: Any, a: Any, mass: Any, units: A
     return solve(matrix * scale[:, None], right * scale)[n:]
 
 
-def _names(stem: str, out: Any) -> tuple[str, ...]:
+def _names(stem: str, out: PyTree) -> tuple[str, ...]:
     shapes = jax.tree.map(lambda s: np.zeros(s.shape), out)
     return tuple(stem + name for name in Layout.of(shapes).names())
 
 
-def _flat(tree: Any, dtype: Any) -> Float[Array, " n"]:
+def _flat(tree: PyTree, dtype: DType) -> Float[Array, " n"]:
     leaves = [jnp.ravel(jnp.asarray(leaf, dtype)) for leaf in jax.tree.leaves(tree)]
     return jnp.concatenate(leaves) if len(leaves) > 1 else leaves[0]

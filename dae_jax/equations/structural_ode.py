@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -9,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..linalg import (
     Tearing,
@@ -23,10 +24,12 @@ from ..linalg import (
     tearing,
 )
 from ..structure import interpreted
-from ..systems import is_mechanism
+from ..systems import System, is_mechanism
+from ..types import Args, DType, Flat, IntScalar, Scalar, State, Time
+from .constraint_jacobian import Rank
 from .derivative_orders import Combination, derivative_of, find_offsets
 from .initial_rates import is_nonlinear, rates_of
-from .manifold_ode import ManifoldODE, at_one_instant
+from .manifold_ode import Feedback, ManifoldODE, at_one_instant
 from .mechanical import MechanicalODE
 from .residual_form import ResidualForm
 from .taylor import total_derivatives
@@ -117,7 +120,7 @@ class StructuralODE(ManifoldODE):
     tearing: Tearing = eqx.field(static=True)
 
     @classmethod
-    def of(cls, form: ResidualForm, dtype: Any, complete: bool = False) -> "StructuralODE":
+    def of(cls, form: ResidualForm, dtype: DType, complete: bool = False) -> "StructuralODE":
         """Finds the offsets while tracing. `complete`: once more than needed, so that all variables are in the state and
         all that restricts them is among the invariants.
 
@@ -141,7 +144,7 @@ class StructuralODE(ManifoldODE):
             present[i, variables] = True
         return dataclasses.replace(ode, tearing=tearing(np.where(present, known, 0)))
 
-    def _coefficients(self, dtype: Any) -> tuple[bool, Float[np.ndarray, "n n"]]:
+    def _coefficients(self, dtype: DType) -> tuple[bool, Float[np.ndarray, "n n"]]:
         """Whether the highest derivatives enter linearly, that is whether their coefficients do not depend on them, and
         which of these are numbers.
         """
@@ -163,14 +166,14 @@ class StructuralODE(ManifoldODE):
         """A name for each equation."""
         return self.combination.names(self.form.equations)
 
-    def levels(self, t: Any, y: Float[Array, " N"], x: Float[Array, " n"], count: int) -> list[Float[Array, " n"]]:
+    def levels(self, t: Time, y: Float[Array, " N"], x: Float[Array, " n"], count: int) -> list[Float[Array, " n"]]:
         """F, dF/dt, … at (Y, X): `count` of them, each right in the equations of which only Y and X are needed."""
         both = jnp.concatenate([y, x])
         orders = [take(both, place) for place in self.orders.places]
         more = count + self.combination.degree
         return self.combination.of(total_derivatives(self.form.residual, jnp.asarray(t, y.dtype), orders, more))
 
-    def of_highest_order(self, t: Any, y: Any, x: Any) -> Float[Array, " n"]:
+    def of_highest_order(self, t: Time, y: Float[Array, " N"], x: Flat) -> Float[Array, " n"]:
         """Fᵢ^(Cᵢ)."""
         return self.highest_of(self.levels(t, y, x, max(self.orders.equations) + 1))
 
@@ -179,7 +182,9 @@ class StructuralODE(ManifoldODE):
         return jnp.stack([levels[k][i] for i, k in enumerate(self.orders.equations)])
 
     @at_one_instant
-    def _system(self, t: Any, y: Any, feedback: Any) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
+    def _system(
+        self, t: Time, y: Float[Array, " N"], feedback: Feedback | None
+    ) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
         """The matrix and the right-hand side of the equations for X."""
         zero = jnp.zeros(self.form.size, y.dtype)
         right = -self.of_highest_order(t, y, zero)
@@ -191,18 +196,18 @@ class StructuralODE(ManifoldODE):
             right = right - jnp.stack([jnp.asarray(term, y.dtype) for term in terms])
         return jax.jacfwd(lambda x: self.of_highest_order(t, y, x))(zero), right
 
-    def highest(self, t: Any, y: Float[Array, " N"], feedback: Any = None) -> Float[Array, " n"]:
+    def highest(self, t: Time, y: Float[Array, " N"], feedback: Feedback | None = None) -> Float[Array, " n"]:
         """X, the derivatives of order Dⱼ."""
         return self.tearing.solve(*self._system(t, y, feedback))
 
     # The underlying ODE and the manifold
 
-    def field(self, t: Any, y: Any, feedback: Any = None) -> Any:
+    def field(self, t: Time, y: Float[Array, " N"], feedback: Feedback | None = None) -> Any:
         both = jnp.concatenate([y, self.highest(t, y, feedback)])
         return take(both, self.orders.derivatives)
 
     @at_one_instant
-    def invariants(self, t: Any, y: Any) -> tuple[Float[Array, " levels"], ...]:
+    def invariants(self, t: Time, y: Float[Array, " N"]) -> tuple[Float[Array, " levels"], ...]:
         highest = max(self.orders.equations)
         if not highest:
             return (jnp.zeros(0, y.dtype),)
@@ -215,32 +220,34 @@ class StructuralODE(ManifoldODE):
         names = self.equations
         return tuple(derivative_of(names[i], k) for k in range(max(self.orders.equations)) for i in self.orders.rows(k))
 
-    def violations(self, t: Any, y: Any) -> Float[Array, " m"]:
+    def violations(self, t: Time, y: Float[Array, " N"]) -> Float[Array, " m"]:
         """H(t, Y), all levels."""
         return jnp.concatenate(self.invariants(t, y))
 
     @at_one_instant
-    def normals(self, t: Any, y: Any) -> Float[Array, "m N"]:
+    def normals(self, t: Time, y: Float[Array, " N"]) -> Float[Array, "m N"]:
         """∂H/∂Y, whose rows are normal to the manifold in the metric in which all entries of Y count alike."""
         return jax.jacfwd(self.violations, 1)(t, y)
 
-    def tangent(self, dy: Any, normals: Float[Array, "m N"]) -> Any:
+    def tangent(self, dy: Float[Array, " N"], normals: Float[Array, "m N"]) -> Any:
         if not len(normals):
             return dy
         gram = row_products(normals, normals)
         return dy - self.displace(0, normals, semidefinite_solve(gram, jnp.sum(normals * dy, 1)))
 
-    def displace(self, y: Any, normals: Any, mu: Float[Array, " m"]) -> Any:
+    def displace(self, y: Float[Array, " N"] | float, normals: Float[Array, "m N"], mu: Float[Array, " m"]) -> Any:
         return y + jnp.sum(normals * mu[:, None], 0)
 
-    def retract_along(self, t: Any, y: Any, normals: Any) -> tuple[Any, Bool[Array, ""]]:
+    def retract_along(
+        self, t: Time, y: Float[Array, " N"], normals: Float[Array, "m N"]
+    ) -> tuple[Any, Bool[Array, ""]]:
         if not len(normals):
             return y, jnp.asarray(True)
 
-        def iterate(params: Any) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
+        def iterate(params: PyTree) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
             ode, t, y, normals = params
 
-            def correct(mu: Any) -> tuple[Any, Any]:
+            def correct(mu: Float[Array, " m"]) -> tuple[Any, Any]:
                 here = ode.displace(y, normals, mu)
                 matrix = row_products(ode.normals(t, here), normals)
                 delta = solve(matrix, ode.violations(t, here))
@@ -252,7 +259,9 @@ class StructuralODE(ManifoldODE):
         mu, found = implicit_root(residual, iterate, (self, t, y, normals))
         return self.displace(y, normals, mu), found
 
-    def selection(self, t: Any, y: Any, chosen: Any) -> tuple[Float[Array, "m N"], Bool[Array, ""]]:
+    def selection(
+        self, t: Time, y: Float[Array, " N"], chosen: Float[Array, "m N"] | None
+    ) -> tuple[Float[Array, "m N"], Bool[Array, ""]]:
         """Unit directions of the dummy derivatives, entries of Y that H = 0 determines given the others, and whether they
         are not `chosen`.
 
@@ -286,13 +295,13 @@ class StructuralODE(ManifoldODE):
 
     # The user's state
 
-    def decode(self, t: Any, y: Any) -> Any:
+    def decode(self, t: Time, y: Float[Array, " N"]) -> Any:
         count = self.form.layout.size
         algebraic = 0 in self.orders.variables[:count]
         both = jnp.concatenate([y, self.highest(t, y)]) if algebraic else y
         return self.form.decode(t, take(both, self.orders.places[0][:count]))
 
-    def encode(self, t: Any, state: Any) -> Float[Array, " N"]:
+    def encode(self, t: Time, state: State) -> Float[Array, " N"]:
         """Y of a state: the derivatives of order 1 and higher are those with which the equations hold, or nearly hold."""
         values = self.form.encode(state)
         guess = rates_of(self.form, t, values)[0] if is_nonlinear(self.form, values.dtype) else None
@@ -300,7 +309,7 @@ class StructuralODE(ManifoldODE):
 
     def start(
         self,
-        t: Any,
+        t: Time,
         values: Float[Array, " n"],
         freedom: Float[Array, " n"],
         rates: Float[Array, " n"] | None = None,
@@ -321,11 +330,11 @@ class StructuralODE(ManifoldODE):
         return _nearest(self, t, known, weights)
 
 
-def _nearest(ode: StructuralODE, t: Any, known: Any, weights: Any) -> Any:
+def _nearest(ode: StructuralODE, t: Time, known: Float[Array, " N"], weights: Float[Array, " N"]) -> Any:
     if not any(ode.orders.equations):
         return known
 
-    def moved(y: Any, start: Any, params: Any) -> Any:
+    def moved(y: Float[Array, " N"], start: Float[Array, " N"], params: PyTree) -> Any:
         """The point next to `start` on the linearisation of H = 0 at y."""
         ode, t, _, weights, *_ = params
         a, h = ode.normals(t, y), ode.violations(t, y)
@@ -337,8 +346,8 @@ def _nearest(ode: StructuralODE, t: Any, known: Any, weights: Any) -> Any:
         cut = 100 * jnp.finfo(y.dtype).eps * jnp.maximum(jnp.trace(gram), 1)
         return start - weights**2 * jnp.sum(a * solve(gram + cut * jnp.eye(len(h), dtype=y.dtype), off)[:, None], 0)
 
-    def settled(params: Any, y: Any, towards: Any) -> Any:
-        def correct(y: Any) -> Any:
+    def settled(params: PyTree, y: Float[Array, " N"], towards: Callable[[Array], Array]) -> Any:
+        def correct(y: Float[Array, " N"]) -> Any:
             new = moved(y, towards(y), params)
             return new, relative_change(new - y, y)
 
@@ -350,7 +359,7 @@ def _nearest(ode: StructuralODE, t: Any, known: Any, weights: Any) -> Any:
     pull = jnp.finfo(known.dtype).eps ** 0.6
     aim = lambda y, params: jnp.where(is_value, params[2], y - pull * (y - params[4]))
 
-    def iterate(params: Any) -> Any:
+    def iterate(params: PyTree) -> Any:
         # The nearest point, then what `cut` has left of H there.
         near, _ = settled(params, params[4], lambda y: aim(y, params))
         return settled(params, near, lambda y: y)
@@ -364,7 +373,7 @@ def _pivots(a: Float[Array, "m N"]) -> tuple[Float[Array, "m N"], Float[Array, "
     """The columns that elimination with complete pivoting takes, as unit rows, and the smallest pivot."""
     m, n = a.shape
 
-    def eliminate(k: Any, carry: Any) -> Any:
+    def eliminate(k: IntScalar, carry: tuple[Float[Array, "m N"], Float[Array, "m N"], Scalar]) -> Any:
         a, taken, smallest = carry
         place = jnp.argmax(jnp.abs(a).reshape(-1))
         at_row, at_column = (jnp.arange(m) == place // n)[:, None], jnp.arange(n) == place % n
@@ -381,7 +390,9 @@ def _pivots(a: Float[Array, "m N"]) -> tuple[Float[Array, "m N"], Float[Array, "
     return taken, smallest
 
 
-def underlying_ode(system: Any, t: Any, state: Any, args: Any, rank: int | None = None) -> tuple[Any, ManifoldODE]:
+def underlying_ode(
+    system: System, t: Time, state: State, args: Args, rank: int | Rank | None = None
+) -> tuple[Any, ManifoldODE]:
     """The state and the underlying ODE of any system; a mechanism's is found faster than from the offsets."""
     if is_mechanism(system):
         mechanical = MechanicalODE.of(system, t, state, args, rank)

@@ -8,9 +8,11 @@ import jax.numpy as jnp
 from jax.experimental import jet
 from jaxtyping import Array, Float
 
+from ..types import Flat, Scalar, Time
+
 
 def total_derivatives(
-    residual: Callable[..., Any], t: Float[Array, ""], orders: Sequence[Float[Array, " n"]], count: int
+    residual: Callable[..., Flat], t: Float[Array, ""], orders: Sequence[Float[Array, " n"]], count: int
 ) -> list[Float[Array, " n"]]:
     """F, dF/dt, …, `count` of them, at y^(k) = orders[k]; what is beyond the given orders counts as 0.
 
@@ -30,8 +32,8 @@ def total_derivatives(
     return [first, *others]
 
 
-def _nested(residual: Callable[..., Any], t: Any, y: Sequence[Any], count: int) -> list[Any]:
-    def curve(s: Any) -> Float[Array, " n"]:
+def _nested(residual: Callable[..., Flat], t: Time, y: Sequence[Flat], count: int) -> list[Any]:
+    def curve(s: Scalar) -> Float[Array, " n"]:
         # Taylor's polynomial in nested form: powers of s = 0 have no derivative in JAX.
         value = y[-1]
         for k in reversed(range(1, len(y))):
@@ -47,5 +49,5 @@ def _nested(residual: Callable[..., Any], t: Any, y: Sequence[Any], count: int) 
     return found
 
 
-def _derivative(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+def _derivative(function: Callable[[Scalar], Flat]) -> Callable[[Any], Any]:
     return lambda s: jax.jvp(function, (s,), (jnp.ones_like(s),))[1]

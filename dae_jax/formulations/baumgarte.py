@@ -1,15 +1,20 @@
 """Baumgarte's stabilisation (Pöll, Hafner and Heinzl, sec. 2.2)."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
+from ..equations.constraint_jacobian import Rank
 from ..equations.manifold_ode import ManifoldODE
 from ..equations.structural_ode import underlying_ode
+from ..systems import System
+from ..types import Args, State, Time, Y
 from .interface import AbstractFieldFormulation
 
 
@@ -31,8 +36,8 @@ class Baumgarte(AbstractFieldFormulation):
     Source: J. Baumgarte, Comput. Methods Appl. Mech. Eng. 1 (1972), 1–16.
     """
 
-    alpha: Float[ArrayLike, ""]
-    beta: Float[ArrayLike, ""]
+    alpha: Float[Array, "..."]
+    beta: Float[Array, "..."]
 
     def __init__(self, alpha: Float[ArrayLike, ""], beta: Float[ArrayLike, ""]) -> None:
         for name, value in (("alpha", alpha), ("beta", beta)):
@@ -40,7 +45,7 @@ class Baumgarte(AbstractFieldFormulation):
                 raise TypeError(f"`{name}` of Baumgarte must be a number in 1/s, but is {value!r}.")
             if isinstance(value, float) and not math.isfinite(value):
                 raise ValueError(f"`{name}` of Baumgarte must be finite, but is {value}.")
-        if not isinstance(alpha, jax.core.Tracer) and np.any(np.asarray(alpha) < 0):
+        if not isinstance(alpha, Tracer) and np.any(np.asarray(alpha) < 0):
             raise ValueError(
                 f"`alpha` of Baumgarte must not be negative, but is {alpha}: s² + 2αs + β² has a root with a positive real "
                 "part then, and an error of the constraint grows without bound."
@@ -49,7 +54,7 @@ class Baumgarte(AbstractFieldFormulation):
         self.alpha = jnp.asarray(alpha, jnp.result_type(float, alpha))
         self.beta = jnp.asarray(beta, jnp.result_type(float, beta))
 
-    def refuse(self, system: Any) -> None:
+    def refuse(self, system: System) -> None:
         if np.shape(self.alpha) or np.shape(self.beta):
             raise ValueError(
                 f"`alpha` and `beta` of Baumgarte must be numbers, but have the shapes {np.shape(self.alpha)} and "
@@ -57,11 +62,11 @@ class Baumgarte(AbstractFieldFormulation):
             )
 
     def encode(
-        self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None
+        self, system: System, t: Time, state: State, args: Args = None, rank: int | Rank | None = None
     ) -> tuple[Any, ManifoldODE]:
         return underlying_ode(system, t, state, args, rank)
 
-    def field(self, t: Any, y: Any, ode: Any) -> Any:
+    def field(self, t: Time, y: Y, ode: ManifoldODE) -> Any:
         return ode.field(t, y, self)
 
     def __call__(self, *levels: Float[Array, " m"]) -> Any:
@@ -74,6 +79,6 @@ class Baumgarte(AbstractFieldFormulation):
         return sum(c * level for c, level in zip(polynomial[:0:-1], levels, strict=True))
 
 
-def _product(a: list[Any], b: list[Any]) -> list[Any]:
+def _product(a: Sequence[Array | float], b: Sequence[Array | float]) -> list[Any]:
     """The coefficients of a product of polynomials; `jnp.convolve` is a library call, which no kernel can have in it."""
     return [sum(a[i] * b[k - i] for i in range(len(a)) if 0 <= k - i < len(b)) for k in range(len(a) + len(b) - 1)]

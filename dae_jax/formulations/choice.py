@@ -1,7 +1,5 @@
 """Whether a solver of residuals keeps its order on the equations as they are written."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,9 +9,11 @@ from scipy.sparse.csgraph import structural_rank
 from ..equations.derivative_orders import find_offsets
 from ..equations.residual_form import Form, ResidualForm
 from ..structure import dependence
+from ..systems import System
+from ..types import Args, State, Time
 
 
-def why_not_as_written(system: Any, t: Any, state: Any, args: Any, form: Form, highest: int) -> str:
+def why_not_as_written(system: System, t: Time, state: State, args: Args, form: Form, highest: int) -> str:
     """Why a method that converges for an index up to `highest` need not on the equations as they are written; empty where it
     does. Found while tracing.
 

@@ -2,8 +2,11 @@
 
 from typing import Any, ClassVar
 
+from ..equations.constraint_jacobian import Rank
 from ..equations.manifold_ode import ManifoldODE
 from ..equations.structural_ode import underlying_ode
+from ..systems import System
+from ..types import Args, State, Time, Y
 from .interface import AbstractFieldFormulation
 
 
@@ -19,9 +22,9 @@ class Differentiation(AbstractFieldFormulation):
     changes_field: ClassVar[bool] = False
 
     def encode(
-        self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None
+        self, system: System, t: Time, state: State, args: Args = None, rank: int | Rank | None = None
     ) -> tuple[Any, ManifoldODE]:
         return underlying_ode(system, t, state, args, rank)
 
-    def field(self, t: Any, y: Any, ode: Any) -> Any:
+    def field(self, t: Time, y: Y, ode: ManifoldODE) -> Any:
         return ode.field(t, y)

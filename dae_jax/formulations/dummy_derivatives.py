@@ -6,10 +6,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from ..equations.constraint_jacobian import Rank
 from ..equations.index1_form import Index1Form
 from ..equations.linearised import LinearisedResidual
 from ..equations.residual_form import ResidualForm
 from ..equations.structural_ode import StructuralODE
+from ..systems import System
+from ..types import Args, State, Time, Y
 from .interface import AbstractFieldFormulation, AbstractResidualFormulation
 
 
@@ -35,12 +38,12 @@ class DummyDerivatives(AbstractFieldFormulation):
     def keeps(self) -> tuple[bool, bool]:
         return True, True
 
-    def encode(self, system: Any, t: Any, state: Any, args: Any = None, rank: Any = None) -> Any:
+    def encode(self, system: System, t: Time, state: State, args: Args = None, rank: int | Rank | None = None) -> Any:
         form = ResidualForm.of(system, t, state, args)
         ode = StructuralODE.of(form, jnp.result_type(*jax.tree.leaves(state)))
         return ode.encode(t, state), ode
 
-    def field(self, t: Any, y: Any, ode: Any) -> Any:
+    def field(self, t: Time, y: Y, ode: StructuralODE) -> Any:
         return ode.field(t, y)
 
 
@@ -58,7 +61,7 @@ class ReducedResidual(AbstractResidualFormulation):
         return True, True
 
     def encode(
-        self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None
+        self, system: System, t: Time, state: State, args: Args = None, rank: int | Rank | None = None
     ) -> tuple[Any, LinearisedResidual]:
         y, ode = DummyDerivatives().encode(system, t, state, args, rank)
         form = Index1Form(ode, ode.selection(t, y, None)[0])

@@ -7,6 +7,12 @@ import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 
+from ..equations.constraint_jacobian import Rank
+from ..equations.linearised import LinearisedResidual
+from ..equations.manifold_ode import Equations
+from ..systems import System
+from ..types import Args, Flat, State, Time, Y
+
 
 class AbstractFormulation(eqx.Module):
     """Which equations of a system are integrated.
@@ -40,18 +46,20 @@ class AbstractFormulation(eqx.Module):
     def keeps(self) -> tuple[bool, bool]:
         return False, False
 
-    def refuse(self, system: Any) -> None:
+    def refuse(self, system: System) -> None:
         """Refuses, by a `ValueError` with advice, what the formulation is not for."""
 
     @abc.abstractmethod
-    def encode(self, system: Any, t: Any, state: Any, args: Any = None, rank: Any = None) -> tuple[Any, Any]:
+    def encode(
+        self, system: System, t: Time, state: State, args: Args = None, rank: int | Rank | None = None
+    ) -> tuple[Any, Any]:
         """The integration variables of `state`, and the equations at one instant, which the solver gets as `args`."""
 
     @abc.abstractmethod
     def term(self) -> diffrax.AbstractTerm:
         """What diffrax gets."""
 
-    def decode(self, t: Any, y: Any, ode: Any) -> Any:
+    def decode(self, t: Time, y: Y, ode: Equations) -> Any:
         """The state in the user's structure."""
         return ode.decode(t, y)
 
@@ -60,7 +68,7 @@ class AbstractFieldFormulation(AbstractFormulation):
     """A formulation as an ODE ẏ = field(t, y), for solvers of ODEs."""
 
     @abc.abstractmethod
-    def field(self, t: Any, y: Any, ode: Any) -> Any:
+    def field(self, t: Time, y: Y, ode: Equations) -> Any:
         """ẏ at (t, y)."""
 
     def term(self) -> diffrax.ODETerm:
@@ -70,13 +78,13 @@ class AbstractFieldFormulation(AbstractFormulation):
 class ResidualTerm(diffrax.AbstractTerm):
     """0 = F(t, y, ẏ) where diffrax wants a vector field: what it gets is F(t, y, 0). For solvers of residuals only."""
 
-    def vf(self, t: Any, y: Any, args: Any) -> Any:
+    def vf(self, t: Time, y: Flat, args: LinearisedResidual) -> Any:
         return args.residual(t, y, jnp.zeros_like(y))
 
-    def contr(self, t0: Any, t1: Any, **kwargs: Any) -> Any:
+    def contr(self, t0: Time, t1: Time, **kwargs: object) -> Any:
         return t1 - t0
 
-    def prod(self, vf: Any, control: Any) -> Any:
+    def prod(self, vf: Flat, control: Time) -> Any:
         return vf * control
 
 

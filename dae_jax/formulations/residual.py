@@ -4,8 +4,11 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 
+from ..equations.constraint_jacobian import Rank
 from ..equations.linearised import LinearisedResidual
 from ..equations.residual_form import Form, ResidualForm
+from ..systems import System
+from ..types import Args, State, Time
 from .interface import AbstractResidualFormulation
 
 
@@ -35,7 +38,7 @@ class Residual(AbstractResidualFormulation):
         return self.form != "index-2", self.form != "index-3"
 
     def encode(
-        self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None
+        self, system: System, t: Time, state: State, args: Args = None, rank: int | Rank | None = None
     ) -> tuple[Any, LinearisedResidual]:
         form = ResidualForm.of(system, t, state, args, self.form)
         if self.variable_index is not None and len(self.variable_index) != form.size:

@@ -9,11 +9,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
+from ..equations.constraint_jacobian import Rank
 from ..equations.manifold_ode import at_one_instant
 from ..equations.mechanical import MechanicalODE
 from ..linalg import newton, semidefinite_solve
+from ..systems import ConstrainedSystem, System, is_mechanism
+from ..types import Args, DType, IntScalar, Phase, State, Time
 from ..validate.states import NUMBERS
 from .interface import AbstractFieldFormulation
 
@@ -52,12 +55,12 @@ class StateSpace(AbstractFieldFormulation):
     def keeps(self) -> tuple[bool, bool]:
         return True, True
 
-    def refuse(self, system: Any) -> None:
-        if not hasattr(system, "constraint"):
+    def refuse(self, system: System) -> None:
+        if not is_mechanism(system):
             raise ValueError("StateSpace takes a ConstrainedSystem: its chart gives the positions of a mechanism.")
 
     def encode(
-        self, system: Any, t: Any, state: Any, args: Any = None, rank: int | None = None
+        self, system: ConstrainedSystem, t: Time, state: State, args: Args = None, rank: int | Rank | None = None
     ) -> tuple[Any, "ChartODE"]:
         mechanical = MechanicalODE.of(system, t, state, args, rank)
         if mechanical.nonholonomic:
@@ -69,11 +72,11 @@ class StateSpace(AbstractFieldFormulation):
         ode = ChartODE(mechanical, self.chart, _takes_time(self.chart), mechanical.layout.size - constraints)
         return ode.encode(t, mechanical.encode(state), self.guess), ode
 
-    def field(self, t: Any, y: Any, ode: Any) -> Any:
+    def field(self, t: Time, y: Phase, ode: "ChartODE") -> Any:
         return ode.field(t, y)
 
 
-def _takes_time(chart: Callable[..., Any]) -> bool:
+def _takes_time(chart: Callable[..., State]) -> bool:
     required = [
         p
         for p in inspect.signature(chart).parameters.values()
@@ -92,17 +95,17 @@ class ChartODE(eqx.Module):
     takes_time: bool = eqx.field(static=True)
     dimension: int = eqx.field(static=True)
 
-    def position(self, t: Any, z: Float[Array, " d"]) -> Float[Array, " n"]:
+    def position(self, t: Time, z: Float[Array, " d"]) -> Float[Array, " n"]:
         """ψ(t, z) as a flat vector."""
         q = self.chart(t, z, self.mechanical.args) if self.takes_time else self.chart(z)
         return self.mechanical.layout.flatten(q)
 
-    def velocity(self, t: Any, z: Float[Array, " d"], w: Float[Array, " d"]) -> Float[Array, " n"]:
+    def velocity(self, t: Time, z: Float[Array, " d"], w: Float[Array, " d"]) -> Float[Array, " n"]:
         """J w + ψ_t."""
         return self.mechanical._along(self.position, self.takes_time, t, (z,), (w,))[1]
 
     @at_one_instant
-    def field(self, t: Any, y: Any) -> Any:
+    def field(self, t: Time, y: Phase) -> Any:
         z, w = y
         ode = self.mechanical
         jacobian = jax.jacfwd(self.position, 1)(t, z)
@@ -118,11 +121,11 @@ class ChartODE(eqx.Module):
         reduced = jnp.dot(jacobian.T, apply(jacobian))
         return w, semidefinite_solve(reduced, jnp.dot(jacobian.T, ode.force(t, q, v) - apply(bias)))
 
-    def decode(self, t: Any, y: Any) -> Any:
+    def decode(self, t: Time, y: Phase) -> Any:
         z, w = y
         return self.mechanical.decode(t, (self.position(t, z), self.velocity(t, z, w)))
 
-    def encode(self, t: Any, y: Any, guess: Any) -> Any:
+    def encode(self, t: Time, y: Phase, guess: State) -> Any:
         """(z, ż) of a flat (q, v), by Newton's method on Jᵀ(ψ(z) − q) = 0 from the best of several guesses."""
         q, v = y
         guesses = _guesses(self.dimension, q.dtype) if guess is None else jnp.atleast_2d(jnp.asarray(guess, q.dtype))
@@ -133,7 +136,7 @@ class ChartODE(eqx.Module):
             raise ValueError(f"`chart` must return {q.shape[0]} numbers, as many as q has, but returns {shape[0]}.")
 
         def refine(z: Float[Array, " d"]) -> tuple[Float[Array, " d"], Float[Array, ""]]:
-            def step(_: Any, z: Float[Array, " d"]) -> Float[Array, " d"]:
+            def step(_: IntScalar, z: Float[Array, " d"]) -> Float[Array, " d"]:
                 delta = _least_squares(self, t, z, self.position(t, z) - q)
                 return z - delta * jnp.minimum(1, 1 / (jnp.max(jnp.abs(delta)) + 1e-30))
 
@@ -150,17 +153,17 @@ class ChartODE(eqx.Module):
         return z, _least_squares(self, t, z, v - self.velocity(t, z, jnp.zeros_like(z)))
 
 
-def _normal_equations(z: Float[Array, " d"], params: Any) -> Float[Array, " d"]:
+def _normal_equations(z: Float[Array, " d"], params: PyTree) -> Float[Array, " d"]:
     ode, t, q = params
     return jnp.dot(jax.jacfwd(ode.position, 1)(t, z).T, ode.position(t, z) - q)
 
 
-def _least_squares(ode: ChartODE, t: Any, z: Float[Array, " d"], x: Float[Array, " n"]) -> Float[Array, " d"]:
+def _least_squares(ode: ChartODE, t: Time, z: Float[Array, " d"], x: Float[Array, " n"]) -> Float[Array, " d"]:
     jacobian = jax.jacfwd(ode.position, 1)(t, z)
     return semidefinite_solve(jnp.dot(jacobian.T, jacobian), jnp.dot(jacobian.T, x))
 
 
-def _guesses(dimension: int, dtype: Any) -> Float[Array, "guesses d"]:
+def _guesses(dimension: int, dtype: DType) -> Float[Array, "guesses d"]:
     # Fixed, spread over the range of an angle: a chart is usually made of angles.
     rng = np.random.default_rng(0)
     return jnp.asarray(np.concatenate([np.full((1, dimension), 0.1), rng.uniform(-3, 3, (31, dimension))]), dtype)

@@ -2,7 +2,9 @@
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Inexact
+
+from ..types import IntScalar
 
 
 # Up to UNROLLED unknowns the elimination is straight-line code (3 unknowns: 90 ns in place of 590); up to LOOPED a loop over
@@ -21,7 +23,7 @@ def solve(a: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:
     if a.shape[0] > LOOPED:
         return jnp.linalg.solve(a, b)
 
-    def eliminated(matrix):
+    def eliminated(matrix: Inexact[Array, "n n"]):
         return lambda _, right: _gauss_jordan(matrix, right)
 
     return lax.custom_linear_solve(lambda x: jnp.sum(a * x, 1), b, solve=eliminated(a), transpose_solve=eliminated(a.T))
@@ -38,7 +40,7 @@ def _gauss_jordan(a: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array,
     n = a.shape[0]
     rows = jnp.arange(n)
 
-    def eliminate(j, augmented):
+    def eliminate(j: IntScalar, augmented):
         column = lax.dynamic_slice_in_dim(augmented, j, 1, 1)
         pivot = jnp.argmax(jnp.where(rows >= j, jnp.abs(column[:, 0]), -1))
         at_j, at_pivot = (rows == j)[:, None], (rows == pivot)[:, None]

@@ -43,7 +43,7 @@ class _Level:
     coupling: Int[np.ndarray, "slots e"]
     updates: Int[np.ndarray, "p k 2"]
     old: Int[np.ndarray, " c"]
-    fill: Int[np.ndarray, "p c 3"]
+    fill: Int[np.ndarray, "q c 3"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

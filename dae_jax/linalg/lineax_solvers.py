@@ -38,7 +38,7 @@ class _AbstractSmallSolver(lineax.AbstractLinearSolver):
         return _Matrix(operator.as_matrix(), rows, columns)
 
     def compute(
-        self, state: _Matrix, vector: Any, options: dict[str, Any]
+        self, state: _Matrix, vector: Array, options: dict[str, Any]
     ) -> tuple[Any, lineax.RESULTS, dict[str, Any]]:
         x = self.solve(state.entries, state.rows.flatten(vector))
         return state.columns.unflatten(x), lineax.RESULTS.successful, {}

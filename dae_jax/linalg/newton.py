@@ -11,15 +11,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
+from ..types import DType
 from .dense import solve
 
 
 MAX_STEPS = 20
 
 
-def roundoff(dtype: Any) -> float:
+def roundoff(dtype: DType) -> float:
     """How small the error of a solved unknown is, relative to 1 + its size, when it counts as solved."""
     return 4 * float(jnp.finfo(dtype).eps)
 
@@ -32,7 +33,7 @@ def relative_change(delta: Float[Array, " n"], x: Float[Array, " n"]) -> Float[A
 def newton(
     residual: Callable[[Float[Array, " n"], Any], Float[Array, " n"]],
     x0: Float[Array, " n"],
-    params: Any,
+    params: PyTree,
     *,
     linear_solve: Callable[[Float[Array, "n n"], Float[Array, " n"]], Float[Array, " n"]] = solve,
     max_steps: int = MAX_STEPS,
@@ -40,16 +41,16 @@ def newton(
     """x with residual(x, params) = 0 by Newton's method from `x0`, and whether it was found.
 
     Corrections δₖ are made until what remains, δₖ²/δₖ₋₁ by the observed rate of convergence, is round-off, or until
-    they no longer shrink and are within 1000 times of it (the residual's own round-off, amplified by an ill-conditioned
-    Jacobian). A first correction says nothing of that, unless it is round-off itself: where F is steep it is small
-    however far the solution is. The solution is differentiated implicitly, dx = −(∂F/∂x)⁻¹ ∂F/∂params dparams, in both modes and to any
-    order; `x0` has no derivative.
+    they no longer shrink, nor go on in one direction, and are within 1000 times of it (the residual's own round-off,
+    amplified by an ill-conditioned Jacobian). A first correction says nothing of that, unless it is round-off itself:
+    where F is steep it is small however far the solution is. The solution is differentiated implicitly, dx =
+    −(∂F/∂x)⁻¹ ∂F/∂params dparams, in both modes and to any order; `x0` has no derivative.
     """
 
-    def from_start(x: Float[Array, " n"], given: Any) -> Float[Array, " n"]:
+    def from_start(x: Float[Array, " n"], given: PyTree) -> Float[Array, " n"]:
         return residual(x, given[0])
 
-    def iterate(given: Any) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
+    def iterate(given: PyTree) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
         params, start = given
 
         def correct(x: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
@@ -74,37 +75,56 @@ def fixed_point(
     """
     dtype = jnp.result_type(*jax.tree.leaves(x))
     tolerance = roundoff(dtype)
-    # Near a singular point round-off is amplified so much that corrections end below this without shrinking to less.
-    noise = float(jnp.finfo(dtype).eps) ** 0.55
     one = jnp.ones((), dtype)
-
     proves_nothing = last is None
+    # Near a singular point round-off is amplified so much that corrections end below this without shrinking to less.
+    # So they do where an equation is steep, and there they are no proof.
+    noise = 0.0 if proves_nothing else float(jnp.finfo(dtype).eps) ** 0.55
+
+    def stagnant(last: Any, previous: Any, turned: Any) -> Any:
+        # Round-off has no direction; corrections that go on in one are on their way down an equation that is steep.
+        return turned & (last > previous / 2) & (last < 1000 * tolerance) | (last >= previous) & (last < noise)
 
     def unfinished(carry: Any) -> Bool[Array, ""]:
-        _, last, previous, count = carry
+        _, _, turned, last, previous, count = carry
         remaining = last * jnp.minimum(last / previous, 1)
         if proves_nothing:
             remaining = jnp.where(count == 1, last, remaining)
-        stagnant = (last > previous / 2) & (last < 1000 * tolerance) | (last >= previous) & (last < noise)
         # A NaN compares false and ends the loop.
-        return (count < max_steps) & (remaining > tolerance) & ~stagnant
+        return (count < max_steps) & (remaining > tolerance) & ~stagnant(last, previous, turned)
 
     def body(carry: Any) -> Any:
-        x, last, _, count = carry
-        x, size = correct(x)
+        x, delta, _, last, _, count = carry
+        new, size = correct(x)
+        before, delta = delta, jax.tree.map(jnp.subtract, new, x)
+        turned = _inner(delta, before) <= jnp.sqrt(_inner(delta, delta)) * jnp.sqrt(_inner(before, before)) / 2
         # The correction before the first counts as 1, as if it left δ² behind.
-        return x, size, jnp.where(last < jnp.inf, jnp.maximum(last, jnp.finfo(dtype).tiny), one), count + 1
+        return (
+            new,
+            delta,
+            turned,
+            size,
+            jnp.where(last < jnp.inf, jnp.maximum(last, jnp.finfo(dtype).tiny), one),
+            count + 1,
+        )
 
-    start = (x, jnp.full((), jnp.inf, dtype), one, 0) if last is None else (x, last, one, 1)
-    x, size, previous, _ = lax.while_loop(unfinished, body, start)
+    none = jax.tree.map(jnp.zeros_like, x)
+    first = (jnp.full((), jnp.inf, dtype), one, 0) if last is None else (last, one, 1)
+    x, _, turned, size, previous, _ = lax.while_loop(unfinished, body, (x, none, jnp.asarray(True), *first))
     remaining = size * jnp.minimum(size / previous, 1)
-    return x, (remaining <= tolerance) | (size < 1000 * tolerance) | (size >= previous) & (size < noise)
+    return x, (remaining <= tolerance) | (size <= previous / 2) & (size < 1000 * tolerance) | stagnant(
+        size, previous, turned
+    )
+
+
+def _inner(a: Any, b: Any) -> Float[Array, ""]:
+    return jax.tree.reduce(jnp.add, jax.tree.map(lambda a, b: jnp.sum(a * b), a, b))
 
 
 def implicit_root(
     residual: Callable[[Float[Array, " n"], Any], Float[Array, " n"]],
     iterate: Callable[[Any], tuple[Float[Array, " n"], Any]],
-    params: Any,
+    params: PyTree,
     *,
     linear_solve: Callable[[Any, Float[Array, " n"]], Float[Array, " n"]] = solve,
     jacobian: Callable[[Float[Array, " n"], Any], Any] | None = None,
@@ -119,11 +139,11 @@ def implicit_root(
     jacobian = jax.jacfwd(residual) if jacobian is None else jacobian
 
     @jax.custom_jvp
-    def find(arrays: Any) -> tuple[Float[Array, " n"], Any]:
+    def find(arrays: PyTree) -> tuple[Float[Array, " n"], Any]:
         return iterate(eqx.combine(arrays, static))
 
     @find.defjvp
-    def _(primals: Any, tangents: Any) -> Any:
+    def _(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
         (arrays,), (directions,) = primals, tangents
         x, outcome = find(arrays)
         _, change = jax.jvp(lambda a: residual(x, eqx.combine(a, static)), (arrays,), (directions,))

@@ -1,13 +1,11 @@
 """The norm that step-size control measures errors in."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 
-def rms_norm(x: Any) -> Float[Array, ""]:
+def rms_norm(x: PyTree) -> Float[Array, ""]:
     """The root mean square of all numbers of a pytree; its derivative at 0 is 0.
 
     `optimistix.rms_norm` as a sum: a dot product is a library call, which keeps a loop from becoming one kernel.

@@ -1,11 +1,14 @@
 """Symmetric positive (semi)definite systems S x = b, such as G M⁻¹ Gᵀ λ = b."""
 
 import functools
+from collections.abc import Iterable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
+
+from ..types import IntScalar
 
 
 # Up to UNROLLED unknowns the elimination is straight-line code; up to LOOPED a loop over columns, which still compiles
@@ -41,7 +44,7 @@ def smallest_pivot(s: Float[Array, "m m"]) -> Float[Array, ""]:
     eigenvalue.
     """
 
-    def eliminate(j, carry):
+    def eliminate(j: IntScalar, carry):
         s, smallest = carry
         pivot = s[j, j]
         row = s[j] / jnp.where(pivot > 0, pivot, 1)
@@ -79,7 +82,7 @@ def _unrolled(s: Float[Array, "m m"], b: Float[Array, "m *k"]) -> Float[Array, "
     return jnp.stack(x) if m else b
 
 
-def _sum(terms):
+def _sum(terms: Iterable[Array]):
     terms = list(terms)
     return sum(terms[1:], terms[0]) if terms else 0.0
 
@@ -91,7 +94,7 @@ def _looped(s: Float[Array, "m m"], b: Float[Array, "m *k"]) -> Float[Array, "m 
     rhs = b if b.ndim == 2 else b[:, None]
     rows = jnp.arange(m)
 
-    def eliminate(j, carry):
+    def eliminate(j: IntScalar, carry):
         s, rhs = carry
         pivot = s[j, j]
         inverse = 1 / definite_pivot(pivot, diagonal[j], m)
@@ -110,7 +113,7 @@ def _minimum_norm(s: Float[Array, "m m"], b: Float[Array, "m *k"], rank: int) ->
 
 
 @_minimum_norm.defjvp
-def _(rank: int, primals: Any, tangents: Any) -> Any:
+def _(rank: int, primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
     # Of constant rank: Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973), eq. 4.12, for symmetric S.
     (s, b), (ds, db) = primals, tangents
     inverse = _pseudo_inverse(s, rank)

@@ -6,13 +6,15 @@ derived by JAX in both modes. The unknowns of a band are reordered inside: vecto
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Inexact, Int
+from jaxtyping import Array, Float, Inexact, Int, PyTree
 
+from ..types import IntScalar
 from .dense import LOOPED
 
 
@@ -38,7 +40,7 @@ class Dense:
         lu, pivots, order = lax.linalg.lu(a * scale[:, None])
         return (lu, pivots, order, scale), jnp.min(jnp.abs(jnp.diagonal(lu)))
 
-    def solve(self, factors: Any, b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
+    def solve(self, factors: PyTree, b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
         """x with A x = b."""
         if self.size <= LOOPED:
             return jnp.sum(factors * b, 1)
@@ -138,7 +140,7 @@ class Banded:
         _, (upper, factors, pivots) = lax.scan(eliminate, window, padded[lower:])
         return (upper, factors, pivots, scale), jnp.min(jnp.abs(upper[:, 0]))
 
-    def solve(self, factors: Any, b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
+    def solve(self, factors: PyTree, b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
         """x with A x = b."""
         upper, *eliminations, scale = factors
         b = (b[self.rows] * scale).astype(jnp.result_type(b, upper))
@@ -148,7 +150,7 @@ class Banded:
             places = jnp.arange(lower + 1)
             padded = jnp.concatenate([b, jnp.zeros(lower, b.dtype)])
 
-            def forward(window: Any, given: Any) -> Any:
+            def forward(window: Any, given: PyTree) -> Any:
                 entry, factors, pivot = given
                 window = jnp.concatenate([window, entry[None]])
                 first = jnp.sum(jnp.where(places == pivot, window, 0))
@@ -157,7 +159,7 @@ class Banded:
 
             _, b = lax.scan(forward, padded[:lower], (padded[lower:], lower_factors, pivots))
 
-        def backward(window: Any, given: Any) -> Any:
+        def backward(window: Any, given: PyTree) -> Any:
             entry, row = given
             x = (entry - jnp.sum(row[1:] * window)) / row[0]
             return jnp.concatenate([x[None], window])[:ahead], x
@@ -232,7 +234,7 @@ def _scale(largest: Float[Array, " n"]) -> Float[Array, " n"]:
     return 1 / jnp.where(largest > 0, largest, 1)
 
 
-def _along_rows(combine: Any, a: Inexact[Array, "n k"]) -> Inexact[Array, " n"]:
+def _along_rows(combine: Callable[[Array, Array], Array], a: Inexact[Array, "n k"]) -> Inexact[Array, " n"]:
     """A reduction of each row of a band. XLA hands that of a large matrix to a library, column by column it does not."""
     return functools.reduce(combine, [a[:, k] for k in range(a.shape[1])])
 
@@ -247,7 +249,7 @@ def _inverse(a: Inexact[Array, "n n"]) -> tuple[Inexact[Array, "n n"], Float[Arr
     n = a.shape[0]
     places = jnp.arange(n)
 
-    def eliminate(j: Any, carry: Any) -> Any:
+    def eliminate(j: IntScalar, carry: Any) -> Any:
         a, order, smallest = carry
         column = lax.dynamic_slice_in_dim(a, j, 1, 1)[:, 0]
         pivot = jnp.argmax(jnp.where(places >= j, _size(column), -1))

@@ -3,6 +3,7 @@
 import functools
 from collections.abc import Callable
 
+from ..systems import System
 from .charge_pump import charge_pump as charge_pump
 from .chemistry import akzo_nobel as akzo_nobel, robertson as robertson
 from .circuits import amplifier as amplifier, capacitor_loop as capacitor_loop
@@ -21,7 +22,7 @@ from .surfaces import bead_on_torus as bead_on_torus, knife_edge as knife_edge
 from .wheelset import wheelset as wheelset
 
 
-SCENES: dict[str, Callable[[], Scene]] = {
+SCENES: dict[str, Callable[[], Scene[System]]] = {
     "akzo-nobel": akzo_nobel,
     "amplifier": amplifier,
     "andrews": andrews,

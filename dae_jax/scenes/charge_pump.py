@@ -1,11 +1,14 @@
 """A transistor between two capacitors on a pulsed voltage: nanoseconds and picocoulombs, kinks in time and in the charges."""
 
+from types import ModuleType
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from ..systems import ImplicitDAE
+from ..types import Args, Time
 from .scene import Scene
 
 
@@ -16,8 +19,11 @@ FLAT = THRESHOLD - GAMMA * PHI**0.5 - PHI
 # The voltage rises to HIGH between RISES and STAYS of each PERIOD, and falls after FALLS.
 HIGH, RISES, STAYS, FALLS, PERIOD, END = 20.0, 50e-9, 60e-9, 110e-9, 120e-9, 1200e-9
 
+# Of one transistor, or at all times.
+Voltage = Array | np.ndarray | float
 
-def charge_pump() -> Scene:
+
+def charge_pump() -> Scene[ImplicitDAE]:
     """A MOS transistor whose charges q_g, q_s, q_d follow its voltages at once, between two capacitors; index 2,
     y = (q_g, p_s, q_s, p_d, q_d, u_g, u_s, u_d, i):
 
@@ -30,7 +36,7 @@ def charge_pump() -> Scene:
     G. Denk, U. Feldmann, *How models for MOS transistors reflect charge distribution effects* (1995).
     """
 
-    def residual(t, y, yd, args):
+    def residual(t: Time, y: Array, yd: Array, args: Args):
         gate, source, drain = y[5], y[6], y[7]
         on_gate, in_channel = _charges(jnp, gate, gate - source, gate - drain)
         conserved = [yd[0] + y[8], yd[1] + yd[2], yd[3] + yd[4]]
@@ -45,12 +51,12 @@ def charge_pump() -> Scene:
     )
 
 
-def _pulse(xp, t):
+def _pulse(xp: ModuleType, t: Time):
     within, slope = t % PERIOD, HIGH / (STAYS - RISES)
     return xp.clip(xp.minimum((within - RISES) * slope, (PERIOD - within) * slope), 0.0, HIGH)
 
 
-def _charges(xp, to_bulk, to_source, to_drain):
+def _charges(xp: ModuleType, to_bulk: Voltage, to_source: Voltage, to_drain: Voltage):
     """The charge on the gate, and that at source and at drain each, from the gate's voltage to bulk, source and drain."""
     larger, smaller = xp.maximum(to_source, to_drain), xp.minimum(to_source, to_drain)
     depth = xp.sqrt(PHI - (larger - to_bulk))
@@ -66,20 +72,20 @@ def _state(voltage: float, current: float) -> np.ndarray:
     """y for u_g = `voltage`: what the channel holds has left the capacitors."""
     from scipy.optimize import brentq
 
-    def charges(moved):
+    def charges(moved: float):
         return _charges(np, voltage, voltage - moved / SOURCE, voltage - moved / DRAIN)
 
-    moved: Any = brentq(lambda x: x + charges(x)[1], 0.0, GATE * HIGH, xtol=1e-28, rtol=1e-14)
+    moved: Any = brentq(lambda x: x + charges(x)[1], 0.0, GATE * HIGH, xtol=1e-28, rtol=np.float64(1e-14))
     gate, channel = charges(moved)
     return np.array([gate, moved, channel, moved, channel, voltage, moved / SOURCE, moved / DRAIN, current])
 
 
-def _reference(times):
+def _reference(times: np.ndarray):
     # The current is known where the voltage does not change, and at the end, where it is published.
     current = lambda t: 0.1522565920949845e-3 if t == END else np.nan if _changes(t) else 0.0
     return np.stack([_state(float(_pulse(np, t)), current(t)) for t in np.asarray(times, float)])
 
 
-def _changes(t):
+def _changes(t: Time):
     within = t % PERIOD
     return RISES < within < STAYS or within > FALLS

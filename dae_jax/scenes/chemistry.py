@@ -2,12 +2,14 @@
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from ..systems import ImplicitDAE, SemiExplicitDAE
+from ..types import Args, Time
 from .scene import Scene, published
 
 
-def robertson() -> Scene:
+def robertson() -> Scene[SemiExplicitDAE]:
     """H. H. Robertson's autocatalytic reaction with the conservation of mass as an equation; x = (y₁, y₂), z = y₃.
 
         ẏ₁ = −0.04 y₁ + 10⁴ y₂ y₃,   ẏ₂ = 0.04 y₁ − 10⁴ y₂ y₃ − 3·10⁷ y₂²,   0 = y₁ + y₂ + y₃ − 1.
@@ -15,7 +17,7 @@ def robertson() -> Scene:
     Source of the end values: F. Mazzia, C. Magherini, *Test Set for IVP Solvers* 2.4 (Bari, 2008).
     """
 
-    def f(t, x, z, args):
+    def f(t: Time, x: Array, z: Array, args: Args):
         forth, back, twice = 0.04 * x[0], 1e4 * x[1] * z[0], 3e7 * x[1] ** 2
         return jnp.stack([back - forth, forth - back - twice])
 
@@ -25,7 +27,7 @@ def robertson() -> Scene:
     return Scene("robertson", system, start, 1e11, published(1e11, end), index=1, scale=1e-6, stiff=True, first=1e-6)
 
 
-def akzo_nobel() -> Scene:
+def akzo_nobel() -> Scene[ImplicitDAE]:
     """The chemical Akzo Nobel problem: six species, one of them in equilibrium, carbon dioxide dissolved from the gas.
 
     Source: as of `robertson`; the equations and end values of its problem "Chemical Akzo Nobel".
@@ -42,7 +44,7 @@ def akzo_nobel() -> Scene:
         737.0,
     )
 
-    def residual(t, y, yd, args):
+    def residual(t: Time, y: Array, yd: Array, args: Args):
         a, oxygen, b, c, d, e = y
         root = jnp.sqrt(oxygen)
         r1, r2, r3 = k1 * a**4 * root, k2 * b * c, k2 / equilibrium * a * d

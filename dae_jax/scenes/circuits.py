@@ -2,12 +2,14 @@
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from ..systems import ImplicitDAE
+from ..types import Args, Time
 from .scene import Scene, published
 
 
-def amplifier() -> Scene:
+def amplifier() -> Scene[ImplicitDAE]:
     """Two transistors amplify U(t) = 0.1 sin(200 π t) volts; eight node voltages, five capacitors; index 1, C singular.
 
     A transistor lets β(e^(u/U_F) − 1) through its emitter, the part α of it through its collector.
@@ -17,7 +19,7 @@ def amplifier() -> Scene:
     supply, thermal, alpha, beta, r0, r = 6.0, 0.026, 0.99, 1e-6, 1000.0, 9000.0
     c1, c2, c3, c4, c5 = (1e-6 * k for k in range(1, 6))
 
-    def residual(t, y, yd, args):
+    def residual(t: Time, y: Array, yd: Array, args: Args):
         u = 0.1 * jnp.sin(200 * jnp.pi * t)
         first, second = (beta * (jnp.exp((y[b] - y[e]) / thermal) - 1) for b, e in ((1, 2), (4, 5)))
         return jnp.stack(
@@ -49,7 +51,7 @@ def amplifier() -> Scene:
     return Scene("amplifier", ImplicitDAE(residual), start, 0.2, published(0.2, end), index=1)
 
 
-def capacitor_loop(c1: float = 2.0, c2: float = 1.0, resistance: float = 0.5) -> Scene:
+def capacitor_loop(c1: float = 2.0, c2: float = 1.0, resistance: float = 0.5) -> Scene[ImplicitDAE]:
     """A source sin t in a loop with two capacitors, a resistor beside the second; y = (v₁, v₂, i), index 2:
 
         0 = C₁ (v̇₁ − v̇₂) + i,   0 = C₁ (v̇₂ − v̇₁) + C₂ v̇₂ + v₂/R,   0 = v₁ − sin t.
@@ -58,11 +60,11 @@ def capacitor_loop(c1: float = 2.0, c2: float = 1.0, resistance: float = 0.5) ->
     """
     tau, k = resistance * (c1 + c2), resistance * c1
 
-    def residual(t, y, yd, args):
+    def residual(t: Time, y: Array, yd: Array, args: Args):
         loop = c1 * (yd[0] - yd[1])
         return jnp.stack([loop + y[2], c2 * yd[1] - loop + y[1] / resistance, y[0] - jnp.sin(t)])
 
-    def reference(times):
+    def reference(times: np.ndarray):
         t = np.asarray(times, float)
         decay = np.exp(-t / tau)
         v2 = k * (np.cos(t) + tau * np.sin(t) - decay) / (1 + tau**2)

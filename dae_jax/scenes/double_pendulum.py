@@ -2,12 +2,16 @@
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from ..systems import ConstrainedSystem
+from ..types import Args, Time
 from .scene import Drawing, Scene, State, minimal
 
 
-def double_pendulum(angle1: float = np.pi / 2, angle2: float = np.pi / 2, gravity: float = 9.81) -> Scene:
+def double_pendulum(
+    angle1: float = np.pi / 2, angle2: float = np.pi / 2, gravity: float = 9.81
+) -> Scene[ConstrainedSystem]:
     """The double pendulum of Pöll, Hafner and Heinzl in q = (x₁, y₁, x₂, y₂), 0 = (|r₁|² − 1)/2 = (|r₂ − r₁|² − 1)/2.
 
     Angles from the downward vertical in rad; released at rest, by default with both arms horizontal. Errors of the
@@ -29,11 +33,11 @@ def double_pendulum(angle1: float = np.pi / 2, angle2: float = np.pi / 2, gravit
     )  # fmt: skip
 
 
-def chain(n: int = 8, gravity: float = 9.81) -> Scene:
+def chain(n: int = 8, gravity: float = 9.81) -> Scene[ConstrainedSystem]:
     """A chain of n point masses on massless rods, hung at the origin, released horizontally; q = (x₁, y₁, …, xₙ, yₙ)."""
     force = np.tile([0.0, gravity], n)
 
-    def constraint(t, q, args):
+    def constraint(t: Time, q: Array, args: Args):
         points = q.reshape(n, 2)
         rods = points - jnp.concatenate([jnp.zeros((1, 2), q.dtype), points[:-1]])
         return (jnp.sum(rods * rods, 1) - 1) / 2

@@ -2,12 +2,14 @@
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from ..systems import ImplicitDAE
+from ..types import Args, Time
 from .scene import Scene, published
 
 
-def elastic_crank() -> Scene:
+def elastic_crank() -> Scene[ImplicitDAE]:
     """A crank that turns at 150 rad/s, an elastic connecting rod, a sliding block; y = (p, v, w, λ) in 24 unknowns, index 2:
 
         ṗ = v,   v̇ = w,   M(p) w = f(p, v) − K q − G(p)ᵀ λ,   0 = G(p) v − (0, 0, Ω),
@@ -31,7 +33,7 @@ def elastic_crank() -> Scene:
     c1, c2 = volume * np.array([0, 0, 2 / 3, 1 / 6]), volume * np.array([2 / pi, 0, 0, 0])
     c12, c21 = volume * l2 * np.array([0, 0, 1 / 3, 1 / 6]), volume * l2 * np.array([1 / pi, -0.5 / pi, 0, 0])
 
-    def residual(t, y, yd, args):
+    def residual(t: Time, y: Array, yd: Array, args: Args):
         p, v, w, multipliers = y[:7], y[7:14], y[14:21], y[21:]
         q, qd = p[3:], v[3:]
         sin1, cos1, sin2, cos2 = jnp.sin(p[0]), jnp.cos(p[0]), jnp.sin(p[1]), jnp.cos(p[1])

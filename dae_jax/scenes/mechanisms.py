@@ -2,12 +2,14 @@
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from ..systems import ConstrainedSystem
+from ..types import Args, Time
 from .scene import Drawing, Scene, State, minimal
 
 
-def slider_crank(crank: float = 1.0, rod: float = 2.5, gravity: float = 9.81) -> Scene:
+def slider_crank(crank: float = 1.0, rod: float = 2.5, gravity: float = 9.81) -> Scene[ConstrainedSystem]:
     """A crank (unit mass at its pin), a massless rod and a slider of unit mass on the x axis; q = (θ, s), M = [[1, ¼], [¼, 1]].
 
     The rod closes the loop, 0 = ((s − r sin θ)² + (r cos θ)² − ℓ²)/2, θ from the downward vertical. The off-diagonal
@@ -40,7 +42,7 @@ def slider_crank(crank: float = 1.0, rod: float = 2.5, gravity: float = 9.81) ->
     chart = lambda z: jnp.stack([z[0], crank * jnp.sin(z[0]) + jnp.sqrt(rod**2 - crank**2 * jnp.cos(z[0]) ** 2)])
     start = [2.0, 0.5]
 
-    def points(t, q):
+    def points(t: Time, q: Array):
         pin = crank * jnp.stack([jnp.sin(q[0]), jnp.cos(q[0])])
         return jnp.stack([jnp.zeros(2), pin, jnp.stack([q[1], 0 * q[1]])])
 
@@ -49,7 +51,7 @@ def slider_crank(crank: float = 1.0, rod: float = 2.5, gravity: float = 9.81) ->
     return Scene("slider-crank", system, y0, 10.0, reference, chart=chart, drawing=drawing)
 
 
-def four_bar(redundant: bool = False, base: float = 2.0, gravity: float = 9.81) -> Scene:
+def four_bar(redundant: bool = False, base: float = 2.0, gravity: float = 9.81) -> Scene[ConstrainedSystem]:
     """A parallelogram: cranks of length 1 at (0, 0) and (b, 0), joined by a coupler of length b; unit masses at the pins.
 
     Both pins move on circles in parallel, so that the motion is that of one pendulum. With `redundant`, a third, parallel
@@ -57,7 +59,7 @@ def four_bar(redundant: bool = False, base: float = 2.0, gravity: float = 9.81) 
     """
     pivot = np.array([base, 0.0])
 
-    def constraint(t, q, args):
+    def constraint(t: Time, q: Array, args: Args):
         left, right = q[:2], q[2:]
         middle = (left + right - pivot) / 2
         rods = [left @ left - 1, (right - pivot) @ (right - pivot) - 1, (right - left) @ (right - left) - base**2]
@@ -79,7 +81,7 @@ def four_bar(redundant: bool = False, base: float = 2.0, gravity: float = 9.81) 
     name = "four-bar-redundant" if redundant else "four-bar"
     chart = lambda z: jnp.stack([jnp.sin(z[0]), jnp.cos(z[0]), base + jnp.sin(z[0]), jnp.cos(z[0])])
 
-    def points(t, q):
+    def points(t: Time, q: Array):
         left, right, base_left, base_right = q[:2], q[2:], jnp.zeros(2), jnp.asarray(pivot)
         return jnp.stack([base_left, left, right, base_right, base_right / 2, (left + right) / 2])
 

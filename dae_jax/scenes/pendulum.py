@@ -7,7 +7,9 @@ from ..systems import ConstrainedSystem
 from .scene import Drawing, Scene, State, minimal
 
 
-def pendulum(angle: float = np.pi / 2, angular_velocity: float = 0.0, gravity: float = 9.81) -> Scene:
+def pendulum(
+    angle: float = np.pi / 2, angular_velocity: float = 0.0, gravity: float = 9.81
+) -> Scene[ConstrainedSystem]:
     """The pendulum of Pöll, Hafner and Heinzl: v̇ = (0, g) − λ q, 0 = (|q|² − 1)/2, two degrees of freedom in (q, v).
 
     `angle` from the downward vertical in rad; the default is released horizontally. The reference is exact, by Jacobi
@@ -56,7 +58,9 @@ def _exact(t: np.ndarray, angle: float, rate: float, gravity: float) -> tuple[np
     return 2 * half * whole, 1 - 2 * half**2, rates
 
 
-def moving_pivot_pendulum(amplitude: float = 0.3, frequency: float = 3.0, gravity: float = 9.81) -> Scene:
+def moving_pivot_pendulum(
+    amplitude: float = 0.3, frequency: float = 3.0, gravity: float = 9.81
+) -> Scene[ConstrainedSystem]:
     """A pendulum whose pivot moves as (a sin ωt, 0): 0 = (|q − p(t)|² − 1)/2, a constraint that depends on time.
 
     In the angle: θ̈ = −g sin θ − p̈ₓ cos θ.
@@ -83,7 +87,9 @@ def moving_pivot_pendulum(amplitude: float = 0.3, frequency: float = 3.0, gravit
     return Scene("moving-pivot-pendulum", system, y0, 10.0, reference, chart=chart, drawing=drawing)
 
 
-def spherical_pendulum(polar: float = 1.0, azimuthal_rate: float = 2.0, gravity: float = 9.81) -> Scene:
+def spherical_pendulum(
+    polar: float = 1.0, azimuthal_rate: float = 2.0, gravity: float = 9.81
+) -> Scene[ConstrainedSystem]:
     """A pendulum in space, z pointing down: conserves the energy and the angular momentum x ẏ − y ẋ.
 
     In the polar angle from the downward vertical and the azimuth: θ̈ = φ̇² sin θ cos θ − g sin θ, φ̇ = L / sin² θ.

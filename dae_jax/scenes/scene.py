@@ -3,15 +3,17 @@
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
-from ..systems import System
+from ..systems import AbstractSystem
 
 
 State = tuple[np.ndarray, np.ndarray]
+S = TypeVar("S", bound=AbstractSystem, covariant=True)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +38,7 @@ class Drawing:
 
 
 @dataclasses.dataclass(frozen=True)
-class Scene:
+class Scene(Generic[S]):
     """A system, where it starts, and a reference that does not use the library.
 
     - `name`; `system`; `args`.
@@ -56,7 +58,7 @@ class Scene:
     """
 
     name: str
-    system: System
+    system: S
     y0: Any
     t1: float
     reference: Callable[[np.ndarray], Any]
@@ -77,7 +79,7 @@ class Scene:
             return np.linspace(0.0, t1, count)
         return np.concatenate([[0.0], np.geomspace(self.first, t1, count - 1)])
 
-    def error(self, times: np.ndarray, ys: Any) -> float:
+    def error(self, times: np.ndarray, ys: State) -> float:
         """The largest error of states at the given times, relative where the reference is larger than `scale`."""
         within = np.asarray(times) <= self.horizon
         exact = jax.tree.leaves(self.reference(np.asarray(times)[within]))
@@ -89,7 +91,7 @@ class Scene:
         return float(known.max()) if known.size else np.nan
 
 
-def published(t1: float, end: Any) -> Callable[[np.ndarray], Any]:
+def published(t1: float, end: PyTree[np.ndarray]) -> Callable[[np.ndarray], Any]:
     """A reference of which only the state at `t1` is published."""
 
     def reference(times: np.ndarray) -> Any:
@@ -100,7 +102,7 @@ def published(t1: float, end: Any) -> Callable[[np.ndarray], Any]:
 
 
 def minimal(
-    field: Callable[[float, np.ndarray], np.ndarray], z0: list[float], embed: Callable[[np.ndarray, np.ndarray], State]
+    field: Callable[[float, np.ndarray], np.ndarray], z0: list[float], embed: Callable[[float, np.ndarray], State]
 ) -> Callable[[np.ndarray], State]:
     """A reference from ż = field(t, z) in minimal coordinates, by scipy's DOP853 at rtol 1e-13; `embed(t, z)` is (q, v)
     for one time and state.

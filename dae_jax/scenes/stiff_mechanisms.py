@@ -2,12 +2,14 @@
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from ..systems import ConstrainedSystem
+from ..types import Args, Time
 from .scene import Drawing, Scene, published
 
 
-def car_axis() -> Scene:
+def car_axis() -> Scene[ConstrainedSystem]:
     """An axis whose left end stands on a flat road and whose right end on a bumpy one, each on a stiff spring; index 3.
 
     q = (x_l, y_l, x_r, y_r); the mass is small (κ = m ε²/2, ε = 0.01) and the constraints depend on time.
@@ -17,19 +19,19 @@ def car_axis() -> Scene:
     length, rest, height, omega = 1.0, 0.5, 0.1, 10.0
     kappa = 10 * 1e-2**2 / 2
 
-    def road(t):
+    def road(t: Time):
         y = height * jnp.sin(omega * t)
         return jnp.stack([jnp.sqrt(length**2 - y**2), y])
 
-    def spring(d):
+    def spring(d: Array):
         size = jnp.sqrt(jnp.sum(d**2))
         return (rest - size) / size * d
 
-    def force(t, q, v, args):
+    def force(t: Time, q: Array, v: Array, args: Args):
         weight = kappa * jnp.array([0.0, 1.0, 0.0, 1.0], q.dtype)
         return jnp.concatenate([spring(q[:2]), spring(q[2:] - road(t))]) - weight
 
-    def constraint(t, q, args):
+    def constraint(t: Time, q: Array, args: Args):
         return jnp.stack([jnp.sum(q[:2] * road(t)), jnp.sum((q[:2] - q[2:]) ** 2) - length**2])
 
     system = ConstrainedSystem(force, constraint, mass=np.full(4, kappa))
@@ -43,7 +45,7 @@ def car_axis() -> Scene:
     return Scene("car-axis", system, start, 3.0, reference, index=3, drawing=drawing)
 
 
-def andrews() -> Scene:
+def andrews() -> Scene[ConstrainedSystem]:
     """Andrews' squeezing mechanism: seven plane bodies in three loops, a motor and a spring; index 3, M depends on q.
 
     q = (β, Θ, γ, Φ, δ, Ω, ε), angles.
@@ -59,7 +61,7 @@ def andrews() -> Scene:
     u, ua, ub, zf, zt, fa = 4e-2, 1228e-5, 449e-5, 2e-2, 4e-2, 1421e-5
     sin, cos = jnp.sin, jnp.cos
 
-    def mass(q, args):
+    def mass(q: Array, args: Args):
         _, theta, _, phi, _, omega, _ = q
         one = jnp.ones_like(theta)
         blocks = {
@@ -77,7 +79,7 @@ def andrews() -> Scene:
         entry = lambda i, j: blocks.get((min(i, j), max(i, j)), 0 * one)
         return jnp.stack([jnp.stack([entry(i, j) for j in range(7)]) for i in range(7)])
 
-    def force(t, q, v, args):
+    def force(t: Time, q: Array, v: Array, args: Args):
         _, theta, gamma, phi, _, omega, _ = q
         beta_, theta_, _, phi_, delta_, omega_, epsilon_ = v
         x, y = sd * cos(gamma) + sc * sin(gamma) + xb - xc, sd * sin(gamma) - sc * cos(gamma) + yb - yc
@@ -95,7 +97,7 @@ def andrews() -> Scene:
             ]
         )
 
-    def constraint(t, q, args):
+    def constraint(t: Time, q: Array, args: Args):
         beta, theta, gamma, phi, delta, omega, epsilon = q
         x, y = rr * cos(beta) - d * cos(beta + theta), rr * sin(beta) - d * sin(beta + theta)
         return jnp.stack(
@@ -116,7 +118,7 @@ def andrews() -> Scene:
     end += [0.5244099658805304, 0.5347301163226948, 1.048080741042263]
     reference = published(0.03, (np.array(end), np.full(7, np.nan)))
 
-    def points(t, q):
+    def points(t: Time, q: Array):
         beta, theta, gamma, _, delta, _, epsilon = q
         along = lambda angle: jnp.stack([cos(angle), sin(angle)])
         across = lambda angle: jnp.stack([sin(angle), -cos(angle)])

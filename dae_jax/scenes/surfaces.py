@@ -2,12 +2,14 @@
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from ..systems import ConstrainedSystem
+from ..types import Time
 from .scene import Drawing, Scene, State, minimal
 
 
-def bead_on_torus(major: float = 2.0, minor: float = 1.0, gravity: float = 9.81) -> Scene:
+def bead_on_torus(major: float = 2.0, minor: float = 1.0, gravity: float = 9.81) -> Scene[ConstrainedSystem]:
     """A bead of unit mass that slides without friction on a torus: 0 = ((√(x² + y²) − R)² + z² − r²)/2, z upwards.
 
     No single regular chart covers the torus. The reference uses the two angles, which are periodic: ρ = R + r cos θ,
@@ -44,7 +46,7 @@ def bead_on_torus(major: float = 2.0, minor: float = 1.0, gravity: float = 9.81)
     return Scene("bead-on-torus", system, y0, 5.0, reference, 10.0, drawing=drawing)
 
 
-def knife_edge(slope: float = 0.3, turn: float = 1.0, gravity: float = 9.81) -> Scene:
+def knife_edge(slope: float = 0.3, turn: float = 1.0, gravity: float = 9.81) -> Scene[ConstrainedSystem]:
     """A blade on an inclined plane, q = (x, y, φ), unit mass and inertia: it moves along its edge only,
 
         0 = ẋ sin φ − ẏ cos φ,   with the force g sin(slope) along x.
@@ -67,7 +69,7 @@ def knife_edge(slope: float = 0.3, turn: float = 1.0, gravity: float = 9.81) -> 
         speed = a / turn * s
         return q, np.stack([speed * c, speed * s, np.full_like(t, turn)], -1)
 
-    def points(t, q):
+    def points(t: Time, q: Array):
         half = 0.25 * jnp.stack([jnp.sin(q[2]), jnp.cos(q[2])])
         middle = q[1::-1]
         return jnp.stack([middle - half, middle, middle + half])

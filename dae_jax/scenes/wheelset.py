@@ -2,8 +2,10 @@
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from ..systems import ImplicitDAE
+from ..types import Args, Time
 from .scene import Scene, published
 
 
@@ -15,7 +17,7 @@ SHEAR, POISSON, ELLIPSE, RATIO = 7.92e10, 0.28, 1.3537956, 0.7115218
 ALONG, ACROSS, SPIN, PI = 4.72772197, 4.27526987, 1.97203505, 3.1415926
 
 
-def wheelset() -> Scene:
+def wheelset() -> Scene[ImplicitDAE]:
     """A wheelset at 30 m/s on a straight track; y = (x, y, z, θ, φ, their rates, β, ψ_r, ξ_r, ψ_l, ξ_l, λ), 17 unknowns, index 2:
 
         ṗ = v,   M(p) (v̇, β̇) = f(p, v, β, q, λ) + Q(p, q)ᵀ λ,   0 = Q(p, q) v,   0 = g(p, q),
@@ -28,7 +30,7 @@ def wheelset() -> Scene:
     less.
     """
 
-    def residual(t, y, yd, args):
+    def residual(t: Time, y: Array, yd: Array, args: Args):
         p, v, beta = y[:5], y[5:10], y[10]
         x, _, z, theta, phi = p
         sin_p, cos_p = jnp.sin(phi), jnp.cos(phi)
@@ -81,7 +83,7 @@ def wheelset() -> Scene:
 class _Contact:
     """One wheel on its rail: `gradient` is the row of Q."""
 
-    def __init__(self, p, psi, xi):
+    def __init__(self, p: Array, psi: Array, xi: Array):
         x, _, _, theta, phi = p
         self.xi = xi
         self.sin, self.cos = jnp.sin(psi), jnp.cos(psi)
@@ -104,18 +106,18 @@ class _Contact:
         self.normal = (self.slope * cos_p - sin_p * self.cos) * cos_t + self.sin * sin_t
         self.upward = self.slope * sin_p + self.cos * cos_p
 
-    def angle(self, sign):
+    def angle(self, sign: float):
         """Of the plane of contact."""
         return jnp.arctan(sign * self.normal / self.upward)
 
-    def parallel(self, p):
+    def parallel(self, p: Array):
         """0 where the normals of wheel and rail are parallel."""
         _, _, _, theta, phi = p
         sin_t, cos_t, sin_p, cos_p = jnp.sin(theta), jnp.cos(theta), jnp.sin(phi), jnp.cos(phi)
         along = self.slope * sin_t * cos_p - sin_t * sin_p * self.cos - cos_t * self.sin
         return self.rail_slope * self.upward + self.normal, along
 
-    def creep(self, p, v, turn, load, angle, sign):
+    def creep(self, p: Array, v: Array, turn: Array, load: Array, angle: Array, sign: float):
         """The force on the wheel at its contact."""
         xi, r = self.xi, self.r
         sin_p, cos_p = jnp.sin(p[4]), jnp.cos(p[4])
@@ -155,7 +157,7 @@ class _Contact:
             cos_t * first - sin_t * cos_d * second,
         )
 
-    def moments(self, p, force):
+    def moments(self, p: Array, force: tuple[Array, Array, Array]):
         """What a force at the contact does to yaw, roll and spin."""
         sin_t, cos_t, sin_p, cos_p = jnp.sin(p[3]), jnp.cos(p[3]), jnp.sin(p[4]), jnp.cos(p[4])
         xi, down, ahead = self.xi, self.r * self.cos, self.r * self.sin

@@ -3,38 +3,42 @@
 import dataclasses
 from typing import Any
 
+import diffrax
+from typing_extensions import TypeIs
+
 from .explicit import unrolled
 from .manifold import AbstractManifoldSolver
 from .residual_steps import AbstractResidualSolver
 
 
-def economical(solver: Any, between: bool) -> Any:
+def economical(solver: diffrax.AbstractSolver, between: bool) -> Any:
     """The solver without what a solve does not need, with its stages written out; `between`: points between steps are asked
     for.
     """
     fields = {field.name for field in dataclasses.fields(solver)}
     if "dense" in fields:
         return dataclasses.replace(solver, dense=between)
-    if "solver" in fields and isinstance(solver, AbstractManifoldSolver | AbstractResidualSolver):
-        return dataclasses.replace(solver, solver=economical(solver.solver, between))
+    inner = getattr(solver, "solver", None)
+    if inner is not None and isinstance(solver, AbstractManifoldSolver | AbstractResidualSolver):
+        return dataclasses.replace(solver, solver=economical(inner, between))
     return unrolled(solver)
 
 
-def is_explicit(solver: Any) -> bool:
+def is_explicit(solver: diffrax.AbstractSolver) -> bool:
     """Whether a solver is an explicit Runge–Kutta method whose stages can be taken elsewhere than its state."""
     return hasattr(unrolled(solver), "step_and_retract")
 
 
-def is_recomputable(solver: Any) -> bool:
+def is_recomputable(solver: diffrax.AbstractSolver) -> bool:
     """Whether a step can be done once more from its start alone."""
     return is_explicit(solver) or getattr(solver, "recomputable", False)
 
 
-def takes_residuals(solver: Any) -> bool:
+def takes_residuals(solver: diffrax.AbstractSolver) -> TypeIs[AbstractResidualSolver]:
     """Whether a solver works on 0 = F(t, y, ẏ) in place of an ODE."""
     return isinstance(solver, AbstractResidualSolver)
 
 
-def counts(solver: Any) -> tuple[str, ...]:
+def counts(solver: diffrax.AbstractSolver) -> tuple[str, ...]:
     """Which entries of the solver's state at the end of a solve are counts for `stats`."""
     return getattr(solver, "counts", ())

@@ -187,7 +187,7 @@ class BDF(AbstractResidualSolver):
             (_Step(args, sign, t1, h, method.c, y, rate), *constant((y0, state, is_smallest(t0, t1))), tol),
             linear_solve=lambda inverse, b: inverse(b),
             jacobian=lambda y, params: functools.partial(
-                params[0].linearised.solve, params[0].factor(y, params[2])[0].matrix
+                params[0].linearised.solve, params[0].factor(y, params[-1])[0].matrix
             ),
         )
         # Row j of the new differences is the change and all rows from j to k; rows above k are not used yet, or are φₖ₊₁.

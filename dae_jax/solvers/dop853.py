@@ -6,7 +6,9 @@ from typing import Any
 import diffrax
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, PyTree
 
+from ..types import Args, BoolLike, Time, Y
 from . import dop853_coefficients as coefficients
 from .explicit import Flat, advanced, combine, first_derivative, identity, stage_slopes, with_retraction
 
@@ -25,12 +27,12 @@ class _Interpolation(diffrax.AbstractLocalInterpolation):
     y0: Any
     f: Any
 
-    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Any:
+    def evaluate(self, t0: Time, t1: Time | None = None, left: bool = True) -> Any:
         if t1 is not None:
             return jax.tree.map(lambda a, b: b - a, self.evaluate(t0), self.evaluate(t1))
         x = (t0 - self.t0) / jnp.where(self.t1 == self.t0, 1, self.t1 - self.t0)
 
-        def nested(y0: Any, f: Any) -> Any:
+        def nested(y0: Array, f: Array) -> Any:
             y = jnp.zeros_like(y0)
             for i in reversed(range(len(f))):
                 y = (y + f[i]) * (x if i % 2 == 0 else 1 - x)
@@ -54,21 +56,38 @@ class DOP853(diffrax.AbstractAdaptiveSolver):
     term_structure = diffrax.ODETerm
     interpolation_cls = _Interpolation
 
-    def order(self, terms: Any) -> int:
+    def order(self, terms: diffrax.AbstractTerm) -> int:
         return 8
 
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+    def func(self, terms: diffrax.AbstractTerm, t0: Time, y0: Y, args: Args) -> Any:
         return terms.vf(t0, y0, args)
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Any:
+    def init(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Y, args: Args) -> Any:
         return terms.vf(t0, y0, args)
 
-    def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any) -> Any:
+    def step(
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: Time,
+        t1: Time,
+        y0: Y,
+        args: Args,
+        solver_state: PyTree,
+        made_jump: BoolLike,
+    ) -> Any:
         *step, _ = self.step_and_retract(terms, t0, t1, y0, args, solver_state, made_jump, identity)
         return *step, diffrax.RESULTS.successful
 
     def step_and_retract(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, state: Any, made_jump: Any, retract: Callable[..., Any]
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: Time,
+        t1: Time,
+        y0: Y,
+        args: Args,
+        state: Y,
+        made_jump: BoolLike,
+        retract: Callable[..., tuple[Y, BoolLike]],
     ) -> Any:
         """`step`, with its end moved to `retract(t1, y1)` → (y1, found)."""
         h = terms.contr(t0, t1)
@@ -87,7 +106,7 @@ class DOP853(diffrax.AbstractAdaptiveSolver):
         dense = {"y0": y0, "f": jax.tree.map(lambda *f: jnp.stack(f), *map(flat.tree, rest))}
         return flat.tree(y1), flat.tree(error), dense, flat.tree(f1), found
 
-    def _interpolant(self, flat: Flat, t0: Any, t1: Any, h: Any, y1: Any, fs: list[Any]) -> list[Any]:
+    def _interpolant(self, flat: Flat, t0: Time, t1: Time, h: Time, y1: Array, fs: list[Array]) -> list[Any]:
         """The coefficients of the nested form."""
         for row, c in zip(_ROWS[STAGES:], coefficients.C[STAGES + 1 :], strict=True):
             fs = [*fs, flat.field(t0 + float(c) * (t1 - t0), advanced(flat.y0, h, row, fs))]
@@ -96,7 +115,7 @@ class DOP853(diffrax.AbstractAdaptiveSolver):
         return slopes + [h * combine(row, fs) for row in coefficients.D]
 
 
-def _error(e5: Any, e3: Any, y0: Any, y1: Any) -> Any:
+def _error(e5: Array, e3: Array, y0: Array, y1: Array) -> Any:
     # Relative to 1 + |y|, the scale of equal relative and absolute tolerances; only the ratio of the two counts.
     weights = 1 / (1 + jnp.maximum(jnp.abs(y0), jnp.abs(y1))) ** 2
     five, three = jnp.sum(weights * e5**2), jnp.sum(weights * e3**2)

@@ -282,7 +282,7 @@ def _solve(step: _Step, state: _State, tol: Tolerances) -> Any:
     def attempt(carry: Any) -> Any:
         tries, fresh, before, jacobians, factors, _ = carry
         renew = (tries > 0) | state.refresh | smallest
-        start = start_of(tries, predicted, before.x)
+        start = start_of(tries, jnp.where(tries == 0, predicted, 0), before.x)
         t, y = jnp.where(smallest, step.t1, step.t0), jnp.where(smallest, step.y0 + start[2], step.y0)
         evaluate = lambda: step.jacobians(step.sign * t, y, state.rates)
         jacobians = lax.cond(renew, evaluate, lambda: jacobians)

@@ -22,11 +22,11 @@ INVERSE = np.linalg.inv(TABLEAU)
 
 # T⁻¹ A⁻¹ T has the blocks γ and [[α, −β], [β, α]].
 _VALUES, _VECTORS = np.linalg.eig(INVERSE)
-_REAL = int(np.argmin(np.abs(_VALUES.imag)))
-_COMPLEX = int(np.argmin(_VALUES.imag))
+_REAL = int(np.argmin(np.abs(np.imag(_VALUES))))
+_COMPLEX = int(np.argmin(np.imag(_VALUES)))
 GAMMA = float(_VALUES[_REAL].real)
 ALPHA, BETA = float(_VALUES[_COMPLEX].real), float(-_VALUES[_COMPLEX].imag)
-TRANSFORM = np.stack([_VECTORS[:, _REAL].real, _VECTORS[:, _COMPLEX].real, _VECTORS[:, _COMPLEX].imag], 1)
+TRANSFORM = np.stack([np.real(_VECTORS[:, _REAL]), np.real(_VECTORS[:, _COMPLEX]), np.imag(_VECTORS[:, _COMPLEX])], 1)
 BACK = np.linalg.inv(TRANSFORM)
 
 # The embedded formula of order 3, ŷ₁ − y₁ = γ₀ (h ẏ₀ + Σ eᵢ zᵢ) with γ₀ = 1/γ (eq. IV.8.19).

@@ -8,8 +8,11 @@ import jax
 import jax.numpy as jnp
 
 from ..equations.constraint_jacobian import mass_solve
+from ..equations.mechanical import MechanicalODE
+from ..systems import ConstrainedSystem, System, is_mechanism
+from ..types import Args, BoolLike, Flat, Phase, State, Time
 from .implicit import hermite
-from .manifold import AbstractManifoldSolver, or_nan, outcome, time_sign
+from .manifold import AbstractManifoldSolver, Formulation, or_nan, outcome, time_sign
 
 
 class RATTLE(AbstractManifoldSolver):
@@ -28,8 +31,8 @@ class RATTLE(AbstractManifoldSolver):
     term_structure = diffrax.ODETerm
     interpolation_cls = diffrax.ThirdOrderHermitePolynomialInterpolation.from_k
 
-    def refuse(self, system: Any, formulation: Any, t0: Any, y0: Any, args: Any) -> None:
-        if not hasattr(system, "mass"):
+    def refuse(self, system: System, formulation: Formulation, t0: Time, y0: State, args: Args) -> None:
+        if not is_mechanism(system):
             raise ValueError("RATTLE takes a ConstrainedSystem; use SymmetricProjection for other systems.")
         if callable(system.mass):
             raise ValueError("RATTLE needs a constant mass matrix, but `mass` is a function; use SymmetricProjection.")
@@ -42,13 +45,22 @@ class RATTLE(AbstractManifoldSolver):
         if _force_uses_velocity(system, t0, y0, args):
             raise ValueError("RATTLE needs a force that does not depend on v; use SymmetricProjection.")
 
-    def order(self, terms: Any) -> int:
+    def order(self, terms: diffrax.AbstractTerm) -> int:
         return 2
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
+    def init(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Phase, args: MechanicalODE) -> None:
         return None
 
-    def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any) -> Any:
+    def step(
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: Time,
+        t1: Time,
+        y0: Phase,
+        args: MechanicalODE,
+        solver_state: None,
+        made_jump: BoolLike,
+    ) -> Any:
         sign, h = time_sign(terms, t0, t1), terms.contr(t0, t1)
         q0, v0 = y0
         t0_, t1_ = sign * t0, sign * t1
@@ -63,16 +75,16 @@ class RATTLE(AbstractManifoldSolver):
         y1 = or_nan(found, (q1, v1))
         return y1, None, hermite(terms, args, t0, t1, y0, y1), None, outcome(jnp.asarray(found))
 
-    def retract(self, t: Any, y: Any, ode: Any) -> Any:
+    def retract(self, t: Time, y: Phase, ode: MechanicalODE) -> Any:
         y, found = ode.retract_along(t, y, ode.normals(t, y))
         return or_nan(found, y)
 
 
-def _free(ode: Any, t: Any, q: Any, v: Any) -> Any:
+def _free(ode: MechanicalODE, t: Time, q: Flat, v: Flat) -> Any:
     return mass_solve(ode.mass(q), ode.force(t, q, v))
 
 
-def _force_uses_velocity(system: Any, t0: Any, y0: Any, args: Any) -> bool:
+def _force_uses_velocity(system: ConstrainedSystem, t0: Time, y0: State, args: Args) -> bool:
     q, v = y0
     arrays, static = eqx.partition(args, eqx.is_array)
     jaxpr = jax.make_jaxpr(lambda v, q, a: system.force(t0, q, v, eqx.combine(a, static)))(v, q, arrays).jaxpr

@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -14,11 +14,18 @@ from jaxtyping import Array, Bool, Float
 from ..linalg import rms_norm, roundoff
 
 
+# As equinox has it.
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractClassVar
+else:
+    from equinox import AbstractClassVar
+
+
 # The part of the tolerance that round-off may use up (BCP, section 5.2.2).
 NOISE = 0.33
-# What a correction may leave of an equation, in parts of what it changes there; and what of it may be round-off, in parts of
-# its terms and of the resolution of numbers.
-LEFT, OFF = 2, 1000
+# What the first and a later correction may leave of an equation, in parts of what they change there; and what of it may be
+# round-off, in parts of its terms and of the resolution of numbers.
+FIRST_LEFT, LEFT, OFF = 0.5, 2, 1000
 # Round-off of the divided differences of algebraic variables, in parts of the variables over h.
 NOISY = 1000
 # How often a correction is halved where algebraic variables jump.
@@ -36,8 +43,8 @@ class AbstractResidualSolver(diffrax.AbstractAdaptiveSolver):
     """
 
     # Up to which index the method converges, and takes the equations as they are written where nothing else is asked for.
-    highest_index: eqx.AbstractClassVar[int]
-    default_index: eqx.AbstractClassVar[int]
+    highest_index: AbstractClassVar[int]
+    default_index: AbstractClassVar[int]
     # Which entries of its state at the end of a solve are counts for `stats`.
     counts: ClassVar[tuple[str, ...]] = ()
 
@@ -141,13 +148,13 @@ class Iteration(NamedTuple):
         """The correction at x."""
         return self.correction(self.residual(x))
 
-    def after(self, x: Any, dx: Any) -> tuple[Any, Any]:
+    def after(self, x: Any, dx: Any, allowed: Any = LEFT) -> tuple[Any, Any]:
         """F at x, and whether the size of the correction Δx that led there says how far the solution is: by a matrix from
         where F was steep it is small wherever that is. Each equation has to be one that about as much more of Δx puts right,
-        by its slope at x, or right to round-off.
+        by its slope at x (at most `allowed` of it), or right to round-off.
         """
         left, change = jax.jvp(self.residual, (x,), (dx,))
-        return left, jnp.all(jnp.abs(left) <= jnp.maximum(LEFT * jnp.abs(change), self.round_off))
+        return left, jnp.all(jnp.abs(left) <= jnp.maximum(allowed * jnp.abs(change), self.round_off))
 
 
 def simplified_newton(iteration: Iteration, start: Any, scale: Any, eta: Any, tol: Tolerances) -> Newton:
@@ -166,7 +173,7 @@ def simplified_newton(iteration: Iteration, start: Any, scale: Any, eta: Any, to
         dx = iteration.correction(off)
         x = s.x + dx
         size = rms_norm(dx * scale)
-        left, trusted = iteration.after(x, dx)
+        left, trusted = iteration.after(x, dx, jnp.where(s.count == 0, FIRST_LEFT, LEFT))
         theta = size / jnp.maximum(s.last, jnp.finfo(start.dtype).tiny)
         first = s.count == 0
         eta = jnp.where(first, jnp.maximum(s.eta, 1e-3) ** 0.8, theta / jnp.maximum(1 - theta, epsilon))

@@ -6,8 +6,11 @@ import diffrax
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
+from jaxtyping import PyTree
 
+from ..equations.manifold_ode import ManifoldODE
 from ..linalg import newton
+from ..types import BoolLike, Flat, Time, Y
 from ..validate.states import brief
 from .implicit import AbstractImplicitSolver, hermite, predictor, stage_end, stage_residual, vector_field
 from .manifold import AbstractManifoldSolver, or_nan, outcome, time_sign
@@ -39,19 +42,28 @@ class SymmetricProjection(AbstractManifoldSolver):
                 f"SymmetricProjection takes a symmetric method, Trapezoid(), Midpoint() or Gauss4(), but got {brief(self.solver)}."
             )
 
-    def order(self, terms: Any) -> Any:
+    def order(self, terms: diffrax.AbstractTerm) -> Any:
         return self.solver.order(terms)
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
+    def init(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Y, args: ManifoldODE) -> None:
         return None
 
-    def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any) -> Any:
+    def step(
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: Time,
+        t1: Time,
+        y0: Y,
+        args: ManifoldODE,
+        solver_state: None,
+        made_jump: BoolLike,
+    ) -> Any:
         tableau = self.solver.tableau
         flat, unravel = ravel_pytree(y0)
         levels = jax.eval_shape(args.invariants, t0, y0)
         stages = len(tableau.implicit) * flat.size
 
-        def residual(x: Any, params: Any) -> Any:
+        def residual(x: Flat, params: PyTree) -> Any:
             terms, args, t0, t1, y0, lengths = params
             sign = time_sign(terms, t0, t1)
             z, y1, mu = x[:stages], unravel(x[stages : stages + flat.size]), x[stages + flat.size :] / lengths
@@ -78,6 +90,6 @@ class SymmetricProjection(AbstractManifoldSolver):
         y1 = or_nan(found, unravel(x[stages : stages + flat.size]))
         return y1, None, hermite(terms, args, t0, t1, y0, y1), None, outcome(found)
 
-    def retract(self, t: Any, y: Any, ode: Any) -> Any:
+    def retract(self, t: Time, y: Y, ode: ManifoldODE) -> Any:
         y, found = ode.project(t, y)
         return or_nan(found, y)

@@ -2,6 +2,11 @@
 
 from typing import Any
 
+import diffrax
+from jaxtyping import PyTree
+
+from ..equations.manifold_ode import ManifoldODE
+from ..types import BoolLike, Time, Y
 from .chart_steps import AbstractChartSolver
 from .manifold import time_sign
 
@@ -25,9 +30,18 @@ class TangentSpace(AbstractChartSolver):
     *Geometric Numerical Integration*, IV.5.
     """
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Any:
+    def init(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Y, args: ManifoldODE) -> Any:
         return terms.vf(t0, y0, args)
 
-    def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any) -> Any:
+    def step(
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: Time,
+        t1: Time,
+        y0: Y,
+        args: ManifoldODE,
+        solver_state: PyTree,
+        made_jump: BoolLike,
+    ) -> Any:
         chart = args.normals(time_sign(terms, t0, t1) * t0, y0)
         return self.step_in(chart, terms, t0, t1, y0, args, solver_state, made_jump)

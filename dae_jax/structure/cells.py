@@ -5,6 +5,9 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.typing import ArrayLike
+
+from ..compiler.types import Aval, Equation
 
 
 class Cells:
@@ -21,19 +24,19 @@ class Cells:
 
     __slots__ = ("dependence", "known", "value")
 
-    def __init__(self, dependence: Any, known: Any, value: Any) -> None:
+    def __init__(self, dependence: np.ndarray | int, known: np.ndarray | bool, value: ArrayLike) -> None:
         self.dependence = as_sets(dependence)
         self.known = np.asarray(known, bool)
         self.value = np.asarray(value)
 
     @classmethod
-    def constant(cls, value: Any) -> "Cells":
+    def constant(cls, value: ArrayLike) -> "Cells":
         """Known numbers."""
         value = np.asarray(value)
         return cls(np.broadcast_to(_NOTHING, value.shape), np.broadcast_to(_TRUE, value.shape), value)
 
     @classmethod
-    def unknown(cls, dependence: Any, aval: Any) -> "Cells":
+    def unknown(cls, dependence: np.ndarray | int, aval: Aval) -> "Cells":
         """Entries with the given dependence, broadcast to the shape of `aval`."""
         dependence = np.broadcast_to(as_sets(dependence), aval.shape)
         return cls(dependence, np.broadcast_to(_FALSE, aval.shape), np.broadcast_to(placeholder(aval), aval.shape))
@@ -51,7 +54,7 @@ class Cells:
         """Entries moved about: `move` applied to all three arrays."""
         return Cells(move(self.dependence), move(self.known), move(self.value))
 
-    def also(self, dependence: Any) -> "Cells":
+    def also(self, dependence: np.ndarray | int) -> "Cells":
         """The same entries, those not known with a further dependence (which broadcasts)."""
         return Cells(unless(self.known, self.dependence | dependence), self.known, self.value)
 
@@ -66,24 +69,24 @@ class Cells:
         return np.array_equal(joined.known, other.known) and np.array_equal(joined.dependence, other.dependence)
 
 
-def placeholder(aval: Any) -> np.ndarray:
+def placeholder(aval: Aval) -> np.ndarray:
     """A zero of the dtype of `aval`; a boolean for dtypes that numpy has not, such as random keys."""
     return np.zeros((), bool if has_extended_dtype(aval) else aval.dtype)
 
 
-def has_extended_dtype(aval: Any) -> bool:
+def has_extended_dtype(aval: Aval) -> bool:
     """Whether the entries are no numbers but, for instance, random keys."""
     return jax.dtypes.issubdtype(aval.dtype, jax.dtypes.extended)
 
 
-def evaluate(eqn: Any, values: list[Any]) -> list[Any]:
+def evaluate(eqn: Equation, values: Sequence[np.ndarray]) -> list[Any]:
     """The outputs of one equation of a jaxpr on numbers, also while an outer function is being traced."""
     with jax.ensure_compile_time_eval():
         out = eqn.primitive.bind(*values, **eqn.params)
     return list(out) if eqn.primitive.multiple_results else [out]
 
 
-def unless(mask: Any, dependence: Any) -> np.ndarray:
+def unless(mask: np.ndarray | bool, dependence: np.ndarray | int) -> np.ndarray:
     """The dependence, and nothing where `mask`."""
     return np.where(mask, _NOTHING, as_sets(dependence))
 
@@ -93,7 +96,7 @@ def union(dependence: np.ndarray, axes: tuple[int, ...], keepdims: bool = False)
     return as_sets(np.bitwise_or.reduce(dependence, axis=axes, initial=0, keepdims=keepdims))
 
 
-def as_sets(dependence: Any) -> np.ndarray:
+def as_sets(dependence: np.ndarray | int) -> np.ndarray:
     """An array of Python integers. numpy's own would overflow, and it makes one of a scalar wherever it can."""
     if isinstance(dependence, np.ndarray) and dependence.dtype != object:
         raise AssertionError(f"Dependences must be Python integers, not {dependence.dtype}.")

@@ -16,10 +16,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Literal
-from jaxtyping import Bool, Float
+from jax.typing import ArrayLike
+from jaxtyping import Bool, Float, PyTree
 
 from ..compiler import ALL_CALLS, called
+from ..compiler.types import Aval, Equation, aval_of
 from . import (
     incidence_contractions as contractions,
     incidence_control as control,
@@ -78,7 +81,7 @@ _CHEAP = frozenset({*entries.ELEMENTWISE, *entries.MOVEMENT, *entries.IDENTITY, 
 }  # fmt: skip
 
 
-def dependence(fn: Callable[..., Any], *example_args: Any, derivative: bool = False) -> list[np.ndarray]:
+def dependence(fn: Callable[..., Any], *example_args: PyTree, derivative: bool = False) -> list[np.ndarray]:
     """Which numbers of `fn(*args)` depend on which numbers of each argument.
 
     `example_args` are pytrees of arrays (or `jax.ShapeDtypeStruct`s), of which shapes and dtypes count, not values.
@@ -107,7 +110,7 @@ class Interpretation(NamedTuple):
     numbers: Float[np.ndarray, " outputs"]
 
 
-def interpreted(fn: Callable[..., Any], *example_args: Any, derivative: bool = False) -> Interpretation:
+def interpreted(fn: Callable[..., Any], *example_args: PyTree, derivative: bool = False) -> Interpretation:
     """All that is known of a function before it is evaluated; for the arguments see `dependence`. With `derivative` no
     output jumps.
     """
@@ -162,7 +165,7 @@ def _run(closed: ClosedJaxpr, inputs: Sequence[Cells], flat: Flat) -> list[Cells
     jaxpr = closed.jaxpr
     env: dict[Any, Cells] = dict(zip(jaxpr.invars, inputs, strict=True))
     for variable, const in zip(jaxpr.constvars, closed.consts, strict=True):
-        env[variable] = _constant(const, variable.aval)
+        env[variable] = _constant(const, aval_of(variable))
     for eqn in jaxpr.eqns:
         if eqn.outvars:
             outputs = _run_eqn(eqn, [_read(env, atom) for atom in eqn.invars], flat)
@@ -170,7 +173,7 @@ def _run(closed: ClosedJaxpr, inputs: Sequence[Cells], flat: Flat) -> list[Cells
     return [_read(env, atom) for atom in jaxpr.outvars]
 
 
-def _run_eqn(eqn: Any, inputs: list[Cells], flat: Flat) -> list[Cells]:
+def _run_eqn(eqn: Equation, inputs: list[Cells], flat: Flat) -> list[Cells]:
     """The outputs of one equation of a jaxpr: numbers where the operands are, else by its rule."""
     name = eqn.primitive.name
     if name not in _CHEAP and not eqn.effects and all(cells.known.all() for cells in inputs):
@@ -197,7 +200,7 @@ def _run_eqn(eqn: Any, inputs: list[Cells], flat: Flat) -> list[Cells]:
     return [_flattened(cells, out.aval, name, flat) for cells, out in zip(outputs, eqn.outvars, strict=True)]
 
 
-def _flattened(cells: Cells, aval: Any, name: str, flat: Flat) -> Cells:
+def _flattened(cells: Cells, aval: Aval, name: str, flat: Flat) -> Cells:
     """With the dependences whose derivative is zero as `flat` has them."""
     if name in entries.FLAT or not jnp.issubdtype(aval.dtype, jnp.inexact):
         return Cells(flat(cells.dependence), cells.known, cells.value)
@@ -205,17 +208,17 @@ def _flattened(cells: Cells, aval: Any, name: str, flat: Flat) -> Cells:
 
 
 def _read(env: Mapping[Any, Cells], atom: Any) -> Cells:
-    return _constant(atom.val, atom.aval) if isinstance(atom, Literal) else env[atom]
+    return _constant(atom.val, aval_of(atom)) if isinstance(atom, Literal) else env[atom]
 
 
-def _constant(value: Any, aval: Any) -> Cells:
+def _constant(value: ArrayLike, aval: Aval) -> Cells:
     """A constant of a jaxpr: known unless it is traced itself or no number."""
-    if isinstance(value, jax.core.Tracer) or has_extended_dtype(aval):
+    if isinstance(value, Tracer) or has_extended_dtype(aval):
         return Cells.unknown(0, aval)
     return Cells.constant(np.asarray(value, aval.dtype))
 
 
-def _aval(leaf: Any) -> Any:
+def _aval(leaf: ArrayLike | jax.ShapeDtypeStruct) -> Any:
     if isinstance(leaf, jax.ShapeDtypeStruct):
         return leaf
     aval = jax.typeof(leaf)

@@ -1,11 +1,12 @@
 """Dependence rules of primitives in which an entry comes from many: sums, products of matrices, linear algebra."""
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
 import numpy as np
 
+from ..compiler.types import Equation
+from ..types import DType
 from .cells import Cells, as_sets, evaluate, union, unless
 
 
@@ -51,7 +52,7 @@ DENSE = {
 }
 
 
-def dense(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+def dense(eqn: Equation, inputs: list[Cells]) -> list[Cells]:
     """Linear algebra and Fourier transforms, matrix by matrix."""
     name = eqn.primitive.name
     batch = inputs[0].dependence.ndim - (len(eqn.params["fft_lengths"]) if name == "fft" else DENSE[name])
@@ -65,7 +66,7 @@ def dense(eqn: Any, inputs: list[Cells]) -> list[Cells]:
     ]
 
 
-def mixed(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+def mixed(eqn: Equation, inputs: list[Cells]) -> list[Cells]:
     """Every entry depends on all entries of all operands."""
     total = 0
     for cells in inputs:
@@ -73,16 +74,16 @@ def mixed(eqn: Any, inputs: list[Cells]) -> list[Cells]:
     return [Cells.unknown(total, out.aval) for out in eqn.outvars]
 
 
-def reduction(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+def reduction(eqn: Equation, inputs: list[Cells]) -> list[Cells]:
     """Sums, products, extrema along axes. A product with a known 0 is 0."""
     (operand,), axes = inputs, tuple(eqn.params["axes"])
-    known = operand.known.all(axes)
+    known = np.asarray(operand.known.all(axes))
     if eqn.primitive.name == "reduce_prod":
         known = known | ~operand.nonzero.all(axes)
     return [_finish(eqn, inputs, union(operand.dependence, axes), known)]
 
 
-def cumulative(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+def cumulative(eqn: Equation, inputs: list[Cells]) -> list[Cells]:
     """Cumulative sums, products and extrema along an axis."""
     (operand,), axis = inputs, eqn.params["axis"]
 
@@ -95,7 +96,7 @@ def cumulative(eqn: Any, inputs: list[Cells]) -> list[Cells]:
     return [_finish(eqn, inputs, dependence, accumulate(np.logical_and, operand.known))]
 
 
-def general_reduction(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+def general_reduction(eqn: Equation, inputs: list[Cells]) -> list[Cells]:
     """`lax.reduce` with any function: each result depends on all operands along the axes."""
     axes, half = tuple(eqn.params["dimensions"]), len(inputs) // 2
     total = np.zeros((), object)
@@ -104,7 +105,7 @@ def general_reduction(eqn: Any, inputs: list[Cells]) -> list[Cells]:
     return [Cells.unknown(total, out.aval) for out in eqn.outvars]
 
 
-def dot_general(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+def dot_general(eqn: Equation, inputs: list[Cells]) -> list[Cells]:
     """Sums of products a_bmk c_bkn; a term with a known 0 adds nothing."""
     (a_sum, c_sum), (a_batch, c_batch) = eqn.params["dimension_numbers"]
     a = inputs[0].map(lambda x: _as_batch_matrix(x, a_batch, a_sum))
@@ -121,7 +122,7 @@ def dot_general(eqn: Any, inputs: list[Cells]) -> list[Cells]:
     return [_finish(eqn, inputs, dependence.reshape(shape), (open_terms == 0).reshape(shape))]
 
 
-def convolution(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+def convolution(eqn: Equation, inputs: list[Cells]) -> list[Cells]:
     """Sums of products of image and kernel; a term with a known 0 adds nothing.
 
     The image entry that meets a kernel entry is found by convolving an image of positions with that entry alone.
@@ -143,7 +144,7 @@ def convolution(eqn: Any, inputs: list[Cells]) -> list[Cells]:
     return [_finish(eqn, inputs, dependence, known)]
 
 
-def triangular_solve(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+def triangular_solve(eqn: Equation, inputs: list[Cells]) -> list[Cells]:
     """Substitution, row by row: the pattern of the triangle is kept."""
     p, (a, b) = eqn.params, inputs
     lower = p["lower"]
@@ -168,7 +169,7 @@ def triangular_solve(eqn: Any, inputs: list[Cells]) -> list[Cells]:
     return [result if p["left_side"] else result.map(lambda x: x.swapaxes(-1, -2))]
 
 
-def sort(eqn: Any, inputs: list[Cells], flat: Callable[[np.ndarray], np.ndarray]) -> list[Cells]:
+def sort(eqn: Equation, inputs: list[Cells], flat: Callable[[np.ndarray], np.ndarray]) -> list[Cells]:
     """Operands put in the order of their keys, on which they depend by jumps, `flat`: every entry along the axis may end up
     anywhere.
     """
@@ -182,14 +183,14 @@ def sort(eqn: Any, inputs: list[Cells], flat: Callable[[np.ndarray], np.ndarray]
     ]
 
 
-def top_k(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+def top_k(eqn: Equation, inputs: list[Cells]) -> list[Cells]:
     """The largest entries along an axis, and where they are."""
     axis = eqn.params.get("axis", -1) % len(inputs[0].shape)
     total = union(inputs[0].dependence, (axis,), keepdims=True)
     return [Cells.unknown(total, out.aval) for out in eqn.outvars]
 
 
-def _finish(eqn: Any, inputs: list[Cells], dependence: Any, known: Any) -> Cells:
+def _finish(eqn: Equation, inputs: list[Cells], dependence: np.ndarray, known: np.ndarray) -> Cells:
     """The result, with its known entries computed from the operands, 0 in place of what is not known."""
     aval = eqn.outvars[0].aval
     known = np.asarray(known)
@@ -199,7 +200,7 @@ def _finish(eqn: Any, inputs: list[Cells], dependence: Any, known: Any) -> Cells
     return Cells(unless(known, dependence), known, evaluate(eqn, values)[0])
 
 
-def _as_batch_matrix(array: np.ndarray, batch: Any, summed: Any) -> np.ndarray:
+def _as_batch_matrix(array: np.ndarray, batch: Sequence[int], summed: Sequence[int]) -> np.ndarray:
     """The array with axes (batch, free, summed)."""
     free = [axis for axis in range(array.ndim) if axis not in {*batch, *summed}]
     sizes = [int(np.prod([array.shape[axis] for axis in axes])) for axes in (batch, free, summed)]
@@ -211,7 +212,7 @@ def _batch_product(a: np.ndarray, c: np.ndarray) -> np.ndarray:
     return np.matmul(a.astype(np.float32), c.astype(np.float32).swapaxes(-1, -2))
 
 
-def _with_dtype(eqn: Any, dtype: Any) -> Any:
+def _with_dtype(eqn: Equation, dtype: DType) -> Equation:
     """The equation with another dtype of its result."""
     params = eqn.params | {"preferred_element_type": jnp.dtype(dtype)}
     return eqn.replace(params=params)

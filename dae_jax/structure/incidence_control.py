@@ -1,11 +1,11 @@
 """Dependence rules of branches, loops and implicitly given linear solves: what runs other jaxprs."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
+from ..compiler.types import Equation
 from .blocks import block_triangular
 from .cells import Cells, as_rows, union
 from .incidence_entries import together
@@ -18,7 +18,7 @@ LONGEST_LOOP = 10_000
 Run = Callable[[ClosedJaxpr, Sequence[Cells]], list[Cells]]
 
 
-def cond(eqn: Any, inputs: list[Cells], run: Run) -> list[Cells]:
+def cond(eqn: Equation, inputs: list[Cells], run: Run) -> list[Cells]:
     """The branch, if it is known; else any branch, and what the choice depends on."""
     choice, *operands = inputs
     branches = eqn.params["branches"]
@@ -30,7 +30,7 @@ def cond(eqn: Any, inputs: list[Cells], run: Run) -> list[Cells]:
     return [cells.also(choice.dependence) for cells in either]
 
 
-def scan(eqn: Any, inputs: list[Cells], run: Run) -> list[Cells]:
+def scan(eqn: Equation, inputs: list[Cells], run: Run) -> list[Cells]:
     """Step by step; a loop of more than `LONGEST_LOOP` steps as one step repeated any number of times."""
     p = eqn.params
     n_consts, n_carry, length = p["num_consts"], p["num_carry"], p["length"]
@@ -49,7 +49,7 @@ def scan(eqn: Any, inputs: list[Cells], run: Run) -> list[Cells]:
     return [*carry, *(together(np.stack, list(y)) for y in ys)]
 
 
-def _long_scan(eqn: Any, consts: list[Cells], carry: list[Cells], xs: list[Cells], run: Run) -> list[Cells]:
+def _long_scan(eqn: Equation, consts: list[Cells], carry: list[Cells], xs: list[Cells], run: Run) -> list[Cells]:
     """A scan in which every step may see any entry of `xs`, after any number of steps."""
     body, n_carry = eqn.params["jaxpr"], len(carry)
     avals = [variable.aval for variable in body.jaxpr.invars[len(consts) + n_carry :]]
@@ -60,7 +60,7 @@ def _long_scan(eqn: Any, consts: list[Cells], carry: list[Cells], xs: list[Cells
     return [*carry, *(Cells.unknown(y.dependence, out.aval) for y, out in zip(ys, outs, strict=True))]
 
 
-def while_loop(eqn: Any, inputs: list[Cells], run: Run) -> list[Cells]:
+def while_loop(eqn: Equation, inputs: list[Cells], run: Run) -> list[Cells]:
     """Step by step while the condition is known; from then on any number of steps, and what decides it."""
     p = eqn.params
     n_cond, n_body = p["cond_nconsts"], p["body_nconsts"]
@@ -92,7 +92,7 @@ def _repeat(step: Callable[[list[Cells]], list[Cells]], state: list[Cells]) -> l
         state = [old.join(new) for old, new in zip(state, after, strict=True)]
 
 
-def linear_solve(eqn: Any, inputs: list[Cells], run: Run) -> list[Cells]:
+def linear_solve(eqn: Equation, inputs: list[Cells], run: Run) -> list[Cells]:
     """A x = b, given by the function x ↦ A x: the pattern of A⁻¹ by blocks, whatever algorithm solves it.
 
     Row i of A x is run with a bit of its own for each unknown, which gives the unknowns in equation i beside what its

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from ..compiler import on_numbers
+from ..compiler.types import Equation
 from .cells import Cells, evaluate, unless
 
 
@@ -23,7 +24,7 @@ ELEMENTWISE = frozenset(_ELEMENTWISE.split())
 FLAT = frozenset(["ceil", "floor", "round", "sign", "stop_gradient"])
 
 
-def elementwise(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+def elementwise(eqn: Equation, inputs: list[Cells]) -> list[Cells]:
     """Each entry depends on what the entries at its place depend on, unless these settle it.
 
     A product with a known 0 is 0, also where the other factor may be infinite.
@@ -39,7 +40,7 @@ def elementwise(eqn: Any, inputs: list[Cells]) -> list[Cells]:
     return [Cells(unless(known, dependence), known, _values(eqn, inputs, settled))]
 
 
-def _settled(eqn: Any, inputs: list[Cells]) -> Any:
+def _settled(eqn: Equation, inputs: list[Cells]) -> Any:
     """Where some operands fix the result whatever the others are."""
     match eqn.primitive.name:
         case "mul":
@@ -57,7 +58,7 @@ def _settled(eqn: Any, inputs: list[Cells]) -> Any:
     return False
 
 
-def _values(eqn: Any, inputs: list[Cells], settled: np.ndarray) -> np.ndarray:
+def _values(eqn: Equation, inputs: list[Cells], settled: np.ndarray) -> np.ndarray:
     """The numbers of the known entries; the others are arbitrary."""
     name, aval = eqn.primitive.name, eqn.outvars[0].aval
     values = [np.broadcast_to(cells.value, aval.shape) for cells in inputs]
@@ -75,7 +76,7 @@ def _values(eqn: Any, inputs: list[Cells], settled: np.ndarray) -> np.ndarray:
     return np.where(settled, np.asarray({"mul": 0, "and": 0, "div": 0}.get(name, 1), aval.dtype), result)
 
 
-def select_n(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+def select_n(eqn: Equation, inputs: list[Cells]) -> list[Cells]:
     """Where the predicate is known the chosen case alone; elsewhere any case and the predicate."""
     predicate, *cases = inputs
     shape = eqn.outvars[0].aval.shape
@@ -123,36 +124,36 @@ IDENTITY = frozenset(
 )
 
 
-def movement(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+def movement(eqn: Equation, inputs: list[Cells]) -> list[Cells]:
     """Entries of one operand at other places."""
     move = MOVEMENT[eqn.primitive.name]
     return [inputs[0].map(lambda a: move(a, eqn.params))]
 
 
-def concatenate(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+def concatenate(eqn: Equation, inputs: list[Cells]) -> list[Cells]:
     """Operands one after the other along an axis."""
     return [together(lambda arrays: np.concatenate(arrays, eqn.params["dimension"]), inputs)]
 
 
-def stack(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+def stack(eqn: Equation, inputs: list[Cells]) -> list[Cells]:
     """Operands one after the other along a new axis."""
     return [together(lambda arrays: np.stack(arrays, eqn.params["axis"]), inputs)]
 
 
-def unstack(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+def unstack(eqn: Equation, inputs: list[Cells]) -> list[Cells]:
     """The slices of an operand along an axis."""
     axis = eqn.params["axis"]
     return [inputs[0].map(lambda a, i=i: np.moveaxis(a, axis, 0)[i, ...]) for i in range(len(eqn.outvars))]
 
 
-def split(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+def split(eqn: Equation, inputs: list[Cells]) -> list[Cells]:
     """An operand cut along an axis."""
     ends = np.cumsum(eqn.params["sizes"])[:-1]
     pieces = [np.split(getattr(inputs[0], field), ends, eqn.params["axis"]) for field in Cells.__slots__]
     return [Cells(*piece) for piece in zip(*pieces, strict=True)]
 
 
-def pad(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+def pad(eqn: Equation, inputs: list[Cells]) -> list[Cells]:
     """An operand with a padding value before, after and between its entries; negative padding cuts."""
     operand, filling = inputs
     config = eqn.params["padding_config"]
@@ -170,7 +171,7 @@ def pad(eqn: Any, inputs: list[Cells]) -> list[Cells]:
     return [Cells(*(place(getattr(operand, field), getattr(filling, field)) for field in Cells.__slots__))]
 
 
-def iota(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+def iota(eqn: Equation, inputs: list[Cells]) -> list[Cells]:
     """0, 1, 2, ... along an axis."""
     del inputs
     shape, axis = eqn.params["shape"], eqn.params["dimension"]

@@ -8,10 +8,12 @@ import itertools
 from collections.abc import Iterator
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ..compiler import gathered, windows
+from ..compiler.types import Equation
 from .cells import Cells, as_sets, union, unless
 
 
@@ -25,7 +27,7 @@ SCATTERS = {
 }
 
 
-def gather(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+def gather(eqn: Equation, inputs: list[Cells]) -> list[Cells]:
     """`operand[indices]`."""
     operand, indices = inputs
     p, aval = eqn.params, eqn.outvars[0].aval
@@ -37,7 +39,7 @@ def gather(eqn: Any, inputs: list[Cells]) -> list[Cells]:
     return [_read(operand, positions, selector, np.asarray(fill).astype(operand.value.dtype))]
 
 
-def scatter(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+def scatter(eqn: Equation, inputs: list[Cells]) -> list[Cells]:
     """`operand.at[indices].set(updates)` and its relatives `add`, `multiply`, `min`, `max`."""
     operand, indices, updates = inputs
     numbers = eqn.params["dimension_numbers"]
@@ -47,7 +49,7 @@ def scatter(eqn: Any, inputs: list[Cells]) -> list[Cells]:
     return [_write(operand, updates, positions, selector, SCATTERS[eqn.primitive.name])]
 
 
-def dynamic_slice(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+def dynamic_slice(eqn: Equation, inputs: list[Cells]) -> list[Cells]:
     """A slice of fixed size whose start is an operand."""
     operand, *starts = inputs
     positions = list(_sliced(operand.shape, starts, eqn.params["slice_sizes"]))
@@ -55,7 +57,7 @@ def dynamic_slice(eqn: Any, inputs: list[Cells]) -> list[Cells]:
     return [_read(operand, positions, selector, operand.value.dtype.type(0))]
 
 
-def dynamic_update_slice(eqn: Any, inputs: list[Cells]) -> list[Cells]:
+def dynamic_update_slice(eqn: Equation, inputs: list[Cells]) -> list[Cells]:
     """An operand with a slice, whose start is an operand, replaced."""
     del eqn
     operand, updates, *starts = inputs
@@ -78,7 +80,7 @@ def _read(operand: Cells, positions: list[np.ndarray], selector: Any, fill: Any)
 
 
 def _write(
-    operand: Cells, updates: Cells, positions: list[np.ndarray], selector: Any, combine: np.ufunc | None
+    operand: Cells, updates: Cells, positions: list[np.ndarray], selector: np.ndarray, combine: np.ufunc | None
 ) -> Cells:
     """The operand with `updates` put at `positions` (−1: dropped), or combined with what is there."""
     first = positions[0]
@@ -112,7 +114,11 @@ def _take(array: np.ndarray, positions: np.ndarray) -> np.ndarray:
 
 
 def _gathered(
-    shape: tuple[int, ...], indices: Cells, numbers: Any, slice_sizes: tuple[int, ...], mode: Any
+    shape: tuple[int, ...],
+    indices: Cells,
+    numbers: jax.lax.GatherDimensionNumbers,
+    slice_sizes: tuple[int, ...],
+    mode: jax.lax.GatherScatterMode | str | None,
 ) -> Iterator[np.ndarray]:
     """The positions that a gather reads, for each choice of the indices that are not known; −1 outside."""
     places = np.arange(int(np.prod(shape)), dtype=int).reshape(shape)

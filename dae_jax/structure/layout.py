@@ -6,7 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 
 @dataclasses.dataclass(frozen=True)
@@ -17,7 +17,7 @@ class Layout:
     shapes: tuple[tuple[int, ...], ...]
 
     @classmethod
-    def of(cls, tree: Any) -> "Layout":
+    def of(cls, tree: PyTree) -> "Layout":
         """The layout of `tree`."""
         leaves, treedef = jax.tree.flatten(tree)
         return cls(treedef, tuple(jnp.shape(leaf) for leaf in leaves))
@@ -50,7 +50,7 @@ class Layout:
         """One number a leaf, to rebuild the pytree with."""
         return list(self.sizes)
 
-    def flatten(self, tree: Any) -> Float[Array, " n"]:
+    def flatten(self, tree: PyTree) -> Float[Array, " n"]:
         """The entries of `tree` as one vector; a single vector is handed back as it is."""
         leaves = [jnp.asarray(leaf) for leaf in jax.tree.leaves(tree)]
         if len(leaves) == 1:

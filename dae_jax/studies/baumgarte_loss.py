@@ -3,7 +3,7 @@
 import dataclasses
 import operator
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import diffrax
 import jax
@@ -12,10 +12,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..formulations import Baumgarte
-from ..solution import RESULTS
+from ..solution import RESULTS, DAESolution
 from ..solve import daesolve
 from ..solvers import DOP853, OrthogonalProjection
 from ..systems import ConstrainedSystem
+from ..types import Args, IntScalar, Solver, State, Time
 
 
 # The loss of a solve that fails: above all that a solve which succeeds can have.
@@ -65,7 +66,7 @@ class BaumgarteLoss:
     times: Float[np.ndarray, " times"] = dataclasses.field(repr=False)
     dt0: float
     reference: Any = dataclasses.field(repr=False)
-    solver: diffrax.AbstractSolver
+    solver: Solver
     weights: tuple[float, float, float]
 
     def __call__(self, params: dict[str, Any]) -> Float[Array, ""]:
@@ -84,7 +85,7 @@ class BaumgarteLoss:
         length = times // 2
         firsts = np.arange(WINDOWS) * (times - length) // (WINDOWS - 1)
         drifts, errors, results = jax.lax.map(lambda i: self._window(params, i, length), jnp.asarray(firsts))
-        code = RESULTS.successful
+        code: Any = RESULTS.successful
         for w in range(WINDOWS):
             code = RESULTS.where(code == RESULTS.successful, jax.tree.map(operator.itemgetter(w), results), code)
         rate = jnp.sqrt(4 * params["alpha"] ** 2 + 2 * params["beta"] ** 2)
@@ -100,7 +101,7 @@ class BaumgarteLoss:
         ]
         return Verification(*map(self._deviation, (tight, *fixed)))
 
-    def _window(self, params: dict[str, Any], first: Any, length: int) -> tuple[Any, Any, Any]:
+    def _window(self, params: dict[str, Any], first: IntScalar, length: int) -> tuple[Any, Any, Any]:
         """Mean squares of drift and error over the times after the first, and the result."""
         times, reference = jax.tree.map(
             lambda x: jax.lax.dynamic_slice_in_dim(jnp.asarray(x), first, length + 1), (self.times, self.reference)
@@ -109,20 +110,20 @@ class BaumgarteLoss:
         sol = self._solve(params, self.solver, self.dt0, start, times, self._steps(self.times[length], self.dt0))
         return *self._mean_squares(times, sol.ys, reference), sol.result
 
-    def _deviation(self, sol: Any) -> Deviation:
+    def _deviation(self, sol: DAESolution) -> Deviation:
         if sol.result != RESULTS.successful:
             return Deviation(np.inf, np.inf)
         drift, error = self._mean_squares(jnp.asarray(self.times), sol.ys, self.reference)
         return Deviation(float(error) ** 0.5, float(drift) ** 0.5)
 
-    def _mean_squares(self, times: Any, ys: Any, reference: Any) -> tuple[Any, Any]:
+    def _mean_squares(self, times: Array | np.ndarray, ys: State, reference: State) -> tuple[Any, Any]:
         """Of the violations and of the errors, without the start, where both are zero."""
         violations = jax.vmap(self._violations)(times[1:], *jax.tree.map(lambda y: y[1:], ys))
         pairs = zip(jax.tree.leaves(ys), jax.tree.leaves(reference), strict=True)
         differences = jnp.concatenate([jnp.ravel(y[1:] - r[1:]) for y, r in pairs])
         return jnp.mean(violations**2), jnp.mean(differences**2)
 
-    def _violations(self, t: Any, q: Any, v: Any) -> Any:
+    def _violations(self, t: Time, q: State, v: State) -> Any:
         found = []
         if self.system.constraint is not None:
             found.append(jnp.ravel(self.system.constraint(t, q, self.args)))
@@ -131,27 +132,34 @@ class BaumgarteLoss:
         return jnp.concatenate(found)
 
     def _solve(
-        self, params: dict[str, Any], solver: Any, h: Any, y0: Any, times: Any, max_steps: int, **options: Any
+        self,
+        params: dict[str, Any],
+        solver: Solver,
+        h: Time | None,
+        y0: State,
+        times: Array | np.ndarray,
+        max_steps: int,
+        **options: Any,
     ) -> Any:
         return daesolve(
             self.system, solver, times[0], times[-1], h, y0, self.args,
-            formulation=Baumgarte(params["alpha"], params["beta"]), saveat=diffrax.SaveAt(ts=times),
+            formulation=Baumgarte(params["alpha"], params["beta"]), saveat=diffrax.SaveAt(ts=cast(Array, times)),
             adjoint=diffrax.ForwardMode(), max_steps=max_steps, throw=False, **options,
         )  # fmt: skip
 
     @staticmethod
-    def _steps(duration: Any, h: float) -> int:
-        return int(np.ceil(float(duration) / h)) + 16
+    def _steps(duration: Time, h: float) -> int:
+        return int(np.ceil(float(cast(float, duration)) / h)) + 16
 
 
 def baumgarte_loss(
     system: ConstrainedSystem,
-    y0: Any,
+    y0: State,
     t1: float,
     *,
     dt0: float,
-    args: Any = None,
-    solver: diffrax.AbstractSolver = diffrax.Tsit5(),  # noqa: B008
+    args: Args = None,
+    solver: Solver = diffrax.Tsit5(),  # noqa: B008
     reference: Callable[[np.ndarray], Any] | None = None,
     weights: tuple[float, float, float] = (1.0, 1.0, 1.0),
     times: int = 100,
@@ -198,7 +206,7 @@ def baumgarte_loss(
     if reference is None:
         rtol = 1e-12 if saved.dtype == jnp.float64 else 1e-6
         truth = daesolve(
-            system, OrthogonalProjection(DOP853()), 0.0, saved[-1], None, y0, args, saveat=diffrax.SaveAt(ts=saved),
+            system, OrthogonalProjection(DOP853()), 0.0, saved[-1], None, y0, args, saveat=diffrax.SaveAt(ts=cast(Array, saved)),
             stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol), max_steps=10_000_000,
         ).ys  # fmt: skip
     else:
@@ -209,6 +217,6 @@ def baumgarte_loss(
         raise ValueError(f"`reference` must give (q, v) of shapes {expected}, but gives {found}.")
     if not all(np.isfinite(x).all() for x in jax.tree.leaves(truth)):
         raise ValueError("`reference` must be finite at every time, but is not; leave it out to have it solved for.")
-    return BaumgarteLoss(
-        system, y0, args, saved, float(dt0), jax.tree.map(np.asarray, truth), solver, tuple(map(float, weights))
-    )
+    of_drift, of_error, of_cost = map(float, weights)
+    truth = jax.tree.map(np.asarray, truth)
+    return BaumgarteLoss(system, y0, args, saved, float(dt0), truth, solver, (of_drift, of_error, of_cost))

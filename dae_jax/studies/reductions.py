@@ -5,13 +5,14 @@ from typing import Any
 import diffrax
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from ..consistent import consistent_state
 from ..diagnostics import drift, energy
 from ..solution import RESULTS, DAESolution
 from ..solve import daesolve
 from ..systems import ConstrainedSystem, System
+from ..types import Args, Solver, State, Time
 
 
 def final_state(sol: DAESolution) -> Any:
@@ -30,10 +31,10 @@ def energy_error(system: ConstrainedSystem, sol: DAESolution) -> Float[Array, ""
     return jnp.max(jnp.abs(total - total[0]))
 
 
-def largest_error(sol: DAESolution, reference: Any) -> Float[Array, ""]:
+def largest_error(sol: DAESolution, reference: State) -> Float[Array, ""]:
     """max |y − reference| over the saved times, infinite where the solve failed; `reference` has the structure of `sol.ys`."""
 
-    def largest(y: Any, r: Any) -> Any:
+    def largest(y: State, r: State) -> Any:
         saved = jnp.isfinite(sol.ts).reshape(-1, *(1,) * (y.ndim - 1))
         return jnp.max(jnp.where(saved, jnp.abs(y - r), 0))
 
@@ -58,13 +59,13 @@ def first_flip(ts: Float[Array, " times"], arm: Float[Array, "times 2"]) -> Floa
 
 def lyapunov(
     system: ConstrainedSystem,
-    solver: diffrax.AbstractSolver,
-    t0: Any,
-    t1: Any,
-    y0: Any,
-    args: Any = None,
+    solver: Solver,
+    t0: Time,
+    t1: Time,
+    y0: State,
+    args: Args = None,
     *,
-    direction: Any = None,
+    direction: State = None,
     **options: Any,
 ) -> Float[Array, ""]:
     """The finite-time Lyapunov exponent, log(|δy(t₁)| / |δy(t₀)|) / (t₁ − t₀), in 1/s.
@@ -76,7 +77,7 @@ def lyapunov(
     along = jax.tree.map(jnp.ones_like, y0) if direction is None else direction
     _, start = jax.jvp(lambda y: consistent_state(system, t0, y, args), (y0,), (along,))
 
-    def end(y: Any) -> Any:
+    def end(y: State) -> Any:
         sol = daesolve(
             system, solver, t0, t1, options.get("dt0"), y, args, adjoint=diffrax.ForwardMode(),
             **{name: value for name, value in options.items() if name != "dt0"},
@@ -87,5 +88,5 @@ def lyapunov(
     return jnp.log(_norm(last) / _norm(start)) / (t1 - t0)
 
 
-def _norm(tree: Any) -> Float[Array, ""]:
+def _norm(tree: PyTree) -> Float[Array, ""]:
     return jnp.sqrt(sum(jnp.sum(x**2) for x in jax.tree.leaves(tree)))

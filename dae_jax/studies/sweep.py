@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import equinox as eqx
 import jax
@@ -18,11 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from ..compiler import processors
 from ..driver.failures import sentence_of
 from ..solution import RESULTS
+from ..types import State
 from ..validate.states import brief
 from .progress import Progress
 from .sweep_store import Memory, Store
@@ -32,6 +34,13 @@ from .sweep_store import Memory, Store
 # its start; on an accelerator they run in step.
 LANES = {"cpu": 512}
 LANES_OF_ACCELERATOR = 8192
+
+
+class Device(Protocol):
+    """One of `jax.devices()`."""
+
+    @property
+    def platform(self) -> str: ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,7 +61,7 @@ class Grid:
         }
 
 
-def grid(**axes: Any) -> Grid:
+def grid(**axes: ArrayLike | Sequence[float]) -> Grid:
     """A grid for `sweep`: `grid(alpha=..., beta=...)`. The function gets {"alpha": α, "beta": β}, the results have a
     leading axis for each name, in this order.
 
@@ -68,14 +77,14 @@ def grid(**axes: Any) -> Grid:
 
 
 def sweep(
-    fn: Callable[[Any], PyTree],
-    inputs: PyTree | Grid,
+    fn: Callable[[Any], State],
+    inputs: State | Grid,
     *,
     chunk_size: int | None = None,
-    devices: Sequence[Any] | None = None,
+    devices: Sequence[Device] | None = None,
     progress: bool = True,
     store: str | os.PathLike[str] | None = None,
-) -> PyTree:
+) -> Any:
     """fn(element) for every element along the leading axis of `inputs`.
 
     **Arguments**
@@ -132,7 +141,7 @@ def sweep(
     return jax.tree.unflatten(structure, arrays)
 
 
-def _leading(elements: Any) -> int:
+def _leading(elements: PyTree) -> int:
     shapes = [x.shape for x in jax.tree.leaves(elements)]
     sizes = {s[0] if s else None for s in shapes}
     if len(sizes) != 1 or None in sizes or 0 in sizes:
@@ -142,7 +151,7 @@ def _leading(elements: Any) -> int:
     return shapes[0][0]
 
 
-def _compiled(fn: Any, elements: Any, chunk: int, devices: list[Any]) -> tuple[Any, Any]:
+def _compiled(fn: Callable[..., PyTree], elements: PyTree, chunk: int, devices: list[Device]) -> tuple[Any, Any]:
     """The compiled function of one chunk, and the shapes of its results."""
     batched, placed = _batched(fn, tuple(devices))
     shape = lambda x: jax.ShapeDtypeStruct(
@@ -154,7 +163,7 @@ def _compiled(fn: Any, elements: Any, chunk: int, devices: list[Any]) -> tuple[A
 
 
 @functools.lru_cache(maxsize=16)
-def _batched(fn: Any, devices: tuple[Any, ...]) -> tuple[Any, NamedSharding]:
+def _batched(fn: Callable[..., PyTree], devices: tuple[Device, ...]) -> tuple[Any, NamedSharding]:
     """`fn` over a chunk that is spread over the devices. Remembered, so that the same sweep compiles once."""
     spec = PartitionSpec("lanes")
     mesh = Mesh(np.array(devices), ("lanes",))
@@ -164,7 +173,14 @@ def _batched(fn: Any, devices: tuple[Any, ...]) -> tuple[Any, NamedSharding]:
     return jax.jit(batched), NamedSharding(mesh, spec)
 
 
-def _run(call: Any, elements: Any, chunk: int, kept: Any, devices: list[Any], report: Callable[[], None]) -> None:
+def _run(
+    call: Callable[..., PyTree],
+    elements: PyTree,
+    chunk: int,
+    kept: PyTree,
+    devices: list[Device],
+    report: Callable[[], None],
+) -> None:
     """All chunks of this process that are not done, several at once: what is no kernel of ours may take one core only."""
     size = jax.tree.leaves(elements)[0].shape[0]
     mine = [c for c in np.flatnonzero(~kept.done) if c % jax.process_count() == jax.process_index()]
@@ -231,7 +247,9 @@ def _message(code: int) -> str:
     return RESULTS[eqx.tree_at(lambda result: result._value, RESULTS.successful, np.asarray(code))]
 
 
-def _state(kept: Any, chunk: int, size: int, failures: Callable[[list[np.ndarray]], Counter[int]]) -> tuple[int, str]:
+def _state(
+    kept: PyTree, chunk: int, size: int, failures: Callable[[list[np.ndarray]], Counter[int]]
+) -> tuple[int, str]:
     done = np.repeat(kept.done, chunk)[:size]
     failed = failures([x[done] for x in kept.arrays]).total()
     return int(done.sum()), f"{failed:,} failed" if failed else ""
@@ -242,7 +260,7 @@ def _gathered(x: np.ndarray) -> np.ndarray:
     return np.asarray(multihost_utils.process_allgather(x))
 
 
-def _fingerprint(fn: Any, elements: Any, chunk: int) -> str:
+def _fingerprint(fn: Callable[..., PyTree], elements: PyTree, chunk: int) -> str:
     """What makes two sweeps the same: the function as it is traced, its constants, the elements, and the chunks."""
     one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], jax.dtypes.canonicalize_dtype(x.dtype)), elements)
     closed = jax.make_jaxpr(fn)(one)

@@ -42,6 +42,9 @@ class Memory:
 class Store(Memory):
     """The same in a folder."""
 
+    arrays: list[np.memmap]
+    done: np.memmap
+
     def __init__(self, arrays: list[np.memmap], done: np.memmap) -> None:
         self.arrays, self.done = list(arrays), done
 
@@ -79,7 +82,7 @@ class Store(Memory):
         if gather is not None:
             # What others wrote is in the same files once they are there.
             multihost_utils.sync_global_devices("dae_jax.sweep end")
-        return self.arrays
+        return list(self.arrays)
 
 
 def _create(folder: Path, shapes: list[tuple[str, Any, Any]], fingerprint: str) -> None:

@@ -7,14 +7,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import ShapedArray
+from jax.typing import ArrayLike
+from jaxtyping import PyTree
 
-from ..systems import AbstractSystem, is_implicit, is_mechanism
+from ..systems import AbstractSystem, System, is_implicit, is_mechanism
+from ..types import State
 
 
 NUMBERS = (jax.Array, np.ndarray, np.generic, jax.ShapeDtypeStruct, float, int, complex, bool)
 
 
-def brief(x: Any) -> str:
+def brief(x: object) -> str:
     """A short repr; a class or a function that was not called is named as such."""
     if isinstance(x, type):
         return f"the class {x.__name__}: write {x.__name__}(...)"
@@ -31,7 +35,7 @@ def counted(number: int, noun: str, plural: str = "") -> str:
     return f"{number} {noun if number == 1 else plural or noun + 's'}"
 
 
-def describe(tree: Any) -> str:
+def describe(tree: PyTree) -> str:
     """The types and shapes of a pytree, in short: float64[2]."""
     text = repr(jax.tree.map(lambda x: _Shape(x) if isinstance(x, NUMBERS) else x, tree))
     return text if len(text) < 120 else text[:120] + "…"
@@ -40,21 +44,21 @@ def describe(tree: Any) -> str:
 class _Shape:
     """Shown as float64[2]."""
 
-    def __init__(self, x: Any) -> None:
-        self.text = jax.core.ShapedArray(jnp.shape(x), jnp.result_type(x)).str_short()
+    def __init__(self, x: ArrayLike | np.generic | jax.ShapeDtypeStruct) -> None:
+        self.text = ShapedArray(jnp.shape(x), jnp.result_type(x)).str_short()
 
     def __repr__(self) -> str:
         return self.text
 
 
-def refuse_wrong_system(system: Any) -> None:
+def refuse_wrong_system(system: System) -> None:
     """Refuses what is none of the three systems."""
     if not isinstance(system, AbstractSystem):
         kind = f"the class {system.__name__}" if isinstance(system, type) else f"a {type(system).__name__}"
         raise TypeError(f"`system` must be a dae_jax.ConstrainedSystem, SemiExplicitDAE or ImplicitDAE, but is {kind}.")
 
 
-def refuse_wrong_state(system: Any, y0: Any, name: str = "y0") -> None:
+def refuse_wrong_state(system: System, y0: State, name: str = "y0") -> None:
     """Refuses a state of another structure than the system's: (q, v), (x, z) or any pytree of numbers."""
     refuse_wrong_system(system)
     if hasattr(y0, "ys") and hasattr(y0, "ts"):
@@ -64,7 +68,8 @@ def refuse_wrong_state(system: Any, y0: Any, name: str = "y0") -> None:
     if len(system.parts) > 1:
         _refuse_no_pair(y0, name, system.pair, _how_to_split(y0, name) if is_mechanism(system) else "")
     if is_mechanism(system):
-        _refuse_unlike(*y0, name)
+        q, v = y0
+        _refuse_unlike(q, v, name)
     leaves = jax.tree.leaves(y0)
     if not leaves:
         raise ValueError(f"`{name}` must hold numbers, but is empty: {brief(y0)}.")
@@ -73,19 +78,19 @@ def refuse_wrong_state(system: Any, y0: Any, name: str = "y0") -> None:
             raise TypeError(f"`{name}` must hold arrays of floating-point numbers, but holds {brief(leaf)}.")
 
 
-def _how_to_split(y0: Any, name: str) -> str:
+def _how_to_split(y0: State, name: str) -> str:
     """Advice for a vector in which v is behind q."""
     flat = isinstance(y0, jax.Array | np.ndarray) and np.ndim(y0) == 1 and np.size(y0) % 2 == 0
     n = np.size(y0) // 2 if flat else 0
     return f"; if v is behind q in it, write `{name}=(y[:{n}], y[{n}:])`" if flat else ""
 
 
-def _refuse_no_pair(y0: Any, name: str, pair: str, advice: str) -> None:
+def _refuse_no_pair(y0: State, name: str, pair: str, advice: str) -> None:
     if not isinstance(y0, tuple | list) or len(y0) != 2:
         raise ValueError(f"`{name}` must be the pair {pair}, but is {brief(y0)}{advice}.")
 
 
-def _refuse_unlike(q: Any, v: Any, name: str) -> None:
+def _refuse_unlike(q: State, v: State, name: str) -> None:
     if jax.tree.structure(q) != jax.tree.structure(v):
         raise ValueError(
             f"`{name}` = (q, v): q and v must have the same structure, but are {describe(q)} and {describe(v)}."
@@ -97,7 +102,7 @@ def _refuse_unlike(q: Any, v: Any, name: str) -> None:
             )
 
 
-def broadcast_to_state(name: str, tree: Any, state: Any, what: str) -> Any:
+def broadcast_to_state(name: str, tree: PyTree, state: State, what: str) -> Any:
     """`tree`, of the structure of `state`, with its leaves in the shapes there.
 
     Errors: `ValueError` where that cannot be.
@@ -112,7 +117,7 @@ def broadcast_to_state(name: str, tree: Any, state: Any, what: str) -> Any:
     )
 
 
-def with_rates(system: Any, yd0: Any, state: Any) -> Any:
+def with_rates(system: System, yd0: State, state: State) -> Any:
     """The system with `yd0`, ẏ near the start, where that is given; refuses one for a system that is explicit in ẏ."""
     if yd0 is None:
         return system

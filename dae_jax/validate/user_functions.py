@@ -8,8 +8,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from ..systems import ConstrainedSystem, System, is_mechanism
+from ..types import Args, State, Time
 from .states import NUMBERS, describe
 
 
@@ -24,7 +26,7 @@ LEADING_AXIS = (
 )
 
 
-def refuse_wrong_functions(system: System, t: Any, state: Any, args: Any) -> None:
+def refuse_wrong_functions(system: System, t: Time, state: State, args: Args) -> None:
     """Refuses functions of a system that cannot be called with (t, state, args), or return what does not fit the state.
 
     Errors: `ValueError` in a sentence with the function's name, what it must return, what it returned, and what to do.
@@ -40,7 +42,7 @@ def refuse_wrong_functions(system: System, t: Any, state: Any, args: Any) -> Non
         raise
 
 
-def time_axis_advice(system: System, t: Any, state: Any, args: Any) -> str:
+def time_axis_advice(system: System, t: Time, state: State, args: Args) -> str:
     """What to say of a state whose leading axis seems to be one of times or of a batch; "" of others."""
     shapes = [jnp.shape(x) for x in jax.tree.leaves(state)]
     if not all(shapes) or len({s[0] for s in shapes}) != 1:
@@ -53,7 +55,7 @@ def time_axis_advice(system: System, t: Any, state: Any, args: Any) -> str:
     return LEADING_AXIS.format(shapes[0][0])
 
 
-def _refuse(system: System, t: Any, state: Any, args: Any) -> None:
+def _refuse(system: System, t: Time, state: State, args: Args) -> None:
     for call in system.calls(t, state, args):
         found = returned(call.signature, call.function, *call.values)
         if call.returns == "structure":
@@ -66,7 +68,7 @@ def _refuse(system: System, t: Any, state: Any, args: Any) -> None:
         _check_mass(system, state[0], args)
 
 
-def returned(call: str, function: Callable[..., Any], *values: Any) -> Any:
+def returned(call: str, function: Callable[..., Any], *values: State) -> Any:
     """The shapes that `function` returns for these arguments; `call` is how it is to be called, `force(t, q, v, args)`."""
     refuse_other_arguments(call, function, len(values))
     try:
@@ -82,7 +84,7 @@ def returned(call: str, function: Callable[..., Any], *values: Any) -> Any:
         ) from error
 
 
-def refuse_other_arguments(call: str, function: Callable[..., Any], count: int, **keywords: Any) -> None:
+def refuse_other_arguments(call: str, function: Callable[..., Any], count: int, **keywords: object) -> None:
     """Refuses functions that cannot be called as `call` says, with `count` arguments and keyword arguments."""
     try:
         signature = inspect.signature(function)
@@ -105,7 +107,7 @@ def _first_line(error: BaseException) -> str:
     return (str(error).strip().splitlines() or [""])[0].rstrip(".")
 
 
-def refuse_no_numbers(found: Any, call: str) -> None:
+def refuse_no_numbers(found: object, call: str) -> None:
     """Refuses results that are not real floating-point numbers; integers have no derivative, booleans neither."""
     for leaf in jax.tree.leaves(found, is_leaf=lambda x: x is None):
         if not isinstance(leaf, NUMBERS):
@@ -117,22 +119,22 @@ def refuse_no_numbers(found: Any, call: str) -> None:
             )
 
 
-def refuse_no_real_number(found: Any, call: str) -> None:
+def refuse_no_real_number(found: object, call: str) -> None:
     """Refuses results that are not one real number."""
     if not isinstance(found, NUMBERS) or jnp.shape(found) != () or np.dtype(jnp.result_type(found)).kind not in "fiu":
         raise ValueError(f"`{call}` must return a real number, but returns {describe(found)}.")
 
 
-def _shapes(tree: Any) -> tuple[Any, list[Any]]:
+def _shapes(tree: PyTree) -> tuple[Any, list[Any]]:
     leaves, structure = jax.tree.flatten(tree)
     return structure, [jnp.shape(x) for x in leaves]
 
 
-def _count(tree: Any) -> int:
+def _count(tree: PyTree) -> int:
     return sum(int(np.prod(jnp.shape(x))) for x in jax.tree.leaves(tree))
 
 
-def _like(found: Any, call: str, like: Any, name: str) -> None:
+def _like(found: object, call: str, like: State, name: str) -> None:
     """The structure and the shapes of `like`; for one vector, as many numbers in any other form."""
     # Numbers of other types are cast to those of the state.
     for leaf in jax.tree.leaves(found, is_leaf=lambda x: x is None):
@@ -140,14 +142,14 @@ def _like(found: Any, call: str, like: Any, name: str) -> None:
             raise ValueError(
                 f"`{call}` must return real numbers in the structure of {name}, but returns {describe(found)}."
             )
-    is_vector = isinstance(like, NUMBERS) and jnp.ndim(like) < 2
+    is_vector = isinstance(like, NUMBERS) and len(jnp.shape(like)) < 2
     if _shapes(found) != _shapes(like) and not (is_vector and _count(found) == _count(like)):
         raise ValueError(
             f"`{call}` must return the structure of {name}, {describe(like)}, but returns {describe(found)}."
         )
 
 
-def _as_many(found: Any, call: str, like: Any, name: str) -> None:
+def _as_many(found: object, call: str, like: State, name: str) -> None:
     refuse_no_numbers(found, call)
     if _count(found) != _count(like):
         raise ValueError(
@@ -156,7 +158,7 @@ def _as_many(found: Any, call: str, like: Any, name: str) -> None:
         )
 
 
-def _is_vector(found: Any, call: str) -> None:
+def _is_vector(found: object, call: str) -> None:
     if not isinstance(found, NUMBERS):
         raise ValueError(
             f"`{call}` must return a number or a vector, one entry a constraint, but returns {describe(found)}: put the "
@@ -170,7 +172,7 @@ def _is_vector(found: Any, call: str) -> None:
         )
 
 
-def _check_mass(system: ConstrainedSystem, q: Any, args: Any) -> None:
+def _check_mass(system: ConstrainedSystem, q: State, args: Args) -> None:
     mass, name = system.mass, "mass"
     if callable(mass):
         name = "mass(q, args)"
@@ -187,11 +189,11 @@ def _check_mass(system: ConstrainedSystem, q: Any, args: Any) -> None:
         )
 
 
-def _all_numbers(tree: Any) -> bool:
+def _all_numbers(tree: PyTree) -> bool:
     return all(isinstance(x, NUMBERS) for x in jax.tree.leaves(tree, is_leaf=lambda x: x is None))
 
 
-def not_finite(system: System, t: Any, state: Any, args: Any) -> str:
+def not_finite(system: System, t: Time, state: State, args: Args) -> str:
     """Which of a system's functions are not finite at a state, in a sentence with what may be the reason; "" if all are."""
     calls = [(call.signature, call.function, call.values) for call in system.calls(t, state, args)]
     if is_mechanism(system) and callable(system.mass):
@@ -205,6 +207,6 @@ def not_finite(system: System, t: Any, state: Any, args: Any) -> str:
     return f"`{'`, `'.join(bad)}` {'is' if len(bad) == 1 else 'are'} not finite at the start{reason}."
 
 
-def _all_finite(tree: Any) -> bool:
+def _all_finite(tree: PyTree) -> bool:
     numbers = [x for x in jax.tree.leaves(tree) if isinstance(x, NUMBERS)]
     return all(bool(jnp.all(jnp.isfinite(jnp.asarray(x)))) for x in numbers)

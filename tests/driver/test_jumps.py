@@ -17,7 +17,7 @@ GRAVITY = 9.81
 # A ball on a vertical wire: x = 0.
 BALL = dae_jax.ConstrainedSystem(lambda t, q, v, e: jnp.array([0.0, -GRAVITY]), lambda t, q, e: q[0])
 RELEASED = (jnp.array([0.0, 1.0]), jnp.zeros(2))
-BOUNCE = dae_jax.Jump(lambda t, y, e, **_: y[0][1], lambda t, y, e: ((y[0], -e * y[1]), e), direction=False)
+BOUNCE = dae_jax.Reset(lambda t, y, e, **_: y[0][1], lambda t, y, e: ((y[0], -e * y[1]), e), direction=False)
 
 
 def bouncing(e, t1, adjoint=None, solver=None, **options):
@@ -80,7 +80,7 @@ def test_a_ball_that_comes_to_rest_is_reported():
 def test_pendulum_with_a_stop_at_its_lowest_point():
     """An elastic stop: it comes back to where it was released, and hits the stop every half period."""
     scene = pendulum()
-    stop = dae_jax.Jump(lambda t, y, args, **_: y[0][0], lambda t, y, args: ((y[0], -y[1]), args))
+    stop = dae_jax.Reset(lambda t, y, args, **_: y[0][0], lambda t, y, args: ((y[0], -y[1]), args))
     quarter = ellipk(0.5) / np.sqrt(GRAVITY)
     sol = dae_jax.daesolve(
         scene.system, dae_jax.OrthogonalProjection(dae_jax.DOP853()), 0.0, 6 * quarter, None, scene.y0, event=stop,
@@ -96,7 +96,7 @@ def test_pendulum_with_a_stop_at_its_lowest_point():
 def test_a_crossing_of_an_algebraic_variable_is_one_jump(solver):
     """Nothing happens at it, so that the next part starts at zero, which z leaves upwards or downwards."""
     system = dae_jax.SemiExplicitDAE(lambda t, x, z, args: jnp.stack([x[1], -x[0]]), lambda t, x, z, args: z - x[0])
-    count = dae_jax.Jump(lambda t, y, args, **_: y[1], lambda t, y, args: (y, args), most=5)
+    count = dae_jax.Reset(lambda t, y, args, **_: y[1], lambda t, y, args: (y, args), max_resets=5)
     sol = dae_jax.daesolve(system, solver, 0.0, 9.0, None, (jnp.array([1.0, 0.0]), jnp.array(1.0)), event=count)
     assert sol.stats["jumps"] == 3
     np.testing.assert_allclose(sol.stats["jump_times"][:3], np.pi * np.array([0.5, 1.5, 2.5]), atol=1e-6)
@@ -108,7 +108,7 @@ def test_a_diode_switches(solver):
     supply, c, r_load, r_on = (lambda t: jnp.sin(2 * t)), 1.0, 5.0, 0.1
     f = lambda t, x, z, on: (z - x / r_load) / c
     g = lambda t, x, z, on: z - on * (supply(t) - x) / r_on
-    switch = dae_jax.Jump(
+    switch = dae_jax.Reset(
         lambda t, y, on, **_: jnp.where(on > 0, y[1][0], y[0][0] - supply(t)),
         lambda t, y, on: (y, 1 - on),
         direction=False,
@@ -140,7 +140,7 @@ def test_refusals():
         bouncing(0.9, 2.0, saveat=diffrax.SaveAt(steps=True))
     with pytest.raises(ValueError, match="use OrthogonalProjection"):
         bouncing(0.9, 2.0, solver=dae_jax.TangentSpace(diffrax.Tsit5()))
-    away = dae_jax.Jump(lambda t, y, e, **_: y[0][1], lambda t, y, e: ((y[0] * jnp.nan, y[1]), e))
+    away = dae_jax.Reset(lambda t, y, e, **_: y[0][1], lambda t, y, e: ((y[0] * jnp.nan, y[1]), e))
     sol = dae_jax.daesolve(BALL, diffrax.Tsit5(), 0.0, 2.0, None, RELEASED, 0.9, event=away, throw=False)
     assert sol.result == dae_jax.RESULTS.inconsistent_start
 
@@ -158,14 +158,14 @@ def test_a_condition_on_an_algebraic_variable_that_the_structure_does_not_give(s
     solve = lambda event: dae_jax.daesolve(
         dae_jax.ImplicitDAE(held_or_pulled), solver, 0.0, 3.0, None, start, 1.0, event=event
     )
-    passed = solve(dae_jax.Jump(lambda t, y, held, **_: 5.886 - y["f"], lambda t, y, held: (y, held)))
+    passed = solve(dae_jax.Reset(lambda t, y, held, **_: 5.886 - y["f"], lambda t, y, held: (y, held)))
     assert passed.stats["jumps"] == 1
     np.testing.assert_allclose(passed.stats["jump_times"][0], 1.1772, atol=1e-7)
     np.testing.assert_allclose(passed.ys["f"], 15.0, atol=1e-6)
 
     condition = lambda t, y, held, **_: jnp.where(held > 0.5, 5.886 - y["f"], 0.5 - y["v"])
     jump = lambda t, y, held: ({**y, "f": jnp.where(held > 0.5, 4.0, y["f"])}, 1 - held)
-    switched = solve(dae_jax.Jump(condition, jump))
+    switched = solve(dae_jax.Reset(condition, jump))
     # x − 0.4 turns by the angle ω t in the plane of (x − 0.4, v/ω), from (0.1886, 0.5/ω) until v is 0.5 again: the arc
     # that is left of a full turn.
     omega, at = np.sqrt(10), 5.886 / 10 - 0.4
@@ -175,7 +175,7 @@ def test_a_condition_on_an_algebraic_variable_that_the_structure_does_not_give(s
 
 
 def test_a_condition_is_a_number_that_crosses_zero():
-    event = dae_jax.Jump(lambda t, y, args, **_: y[0][1] < 0, lambda t, y, args: (y, args))
+    event = dae_jax.Reset(lambda t, y, args, **_: y[0][1] < 0, lambda t, y, args: (y, args))
     with pytest.raises(ValueError, match=r"must return a real number, whose zero is the event, but returns .*bool"):
         dae_jax.daesolve(BALL, diffrax.Tsit5(), 0.0, 1.0, None, RELEASED, event=event)
 
@@ -187,7 +187,7 @@ def test_a_condition_that_is_no_number_is_an_error(direction):
     solve = lambda event: dae_jax.daesolve(BALL, diffrax.Tsit5(), 0.0, 1.0, None, RELEASED, event=event, throw=False)
     ended = solve(diffrax.Event(condition, direction=direction))
     assert ended.result == dae_jax.RESULTS.undefined_condition
-    went_on = solve(dae_jax.Jump(condition, lambda t, y, args: (y, args), direction=direction))
+    went_on = solve(dae_jax.Reset(condition, lambda t, y, args: (y, args), direction=direction))
     assert went_on.result not in (dae_jax.RESULTS.successful, dae_jax.RESULTS.event_occurred)
 
 
@@ -210,3 +210,11 @@ def test_a_state_that_is_no_number_is_no_event():
     for solver in (diffrax.Tsit5(), dae_jax.OrthogonalProjection(diffrax.Tsit5())):
         sol = dae_jax.daesolve(system, solver, 0.0, 1.0, 0.1, RELEASED, event=event, throw=False)
         assert sol.result not in (dae_jax.RESULTS.successful, dae_jax.RESULTS.event_occurred)
+
+
+def test_the_former_name_warns():
+    condition, bounced = lambda t, y, args, **_: y[0][1], lambda t, y, args: (y, args)
+    with pytest.warns(DeprecationWarning, match="is called `Reset"):
+        old = dae_jax.Jump(condition, bounced, most=3)
+    assert isinstance(old, dae_jax.Reset)
+    assert (old.condition, old.reset, old.max_resets) == (condition, bounced, 3)

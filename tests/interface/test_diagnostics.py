@@ -107,7 +107,7 @@ class TestMultipliersAtAPoint:
 
     def test_a_jump_where_the_force_of_the_rod_changes_its_sign(self):
         """A rod turns from pushing to pulling where λ goes up through zero; the count of it is in args."""
-        rises = dae_jax.Jump(
+        rises = dae_jax.Reset(
             lambda t, y, count, **_: dae_jax.multipliers(CIRCLE, t, *y, count)[0],
             lambda t, y, count: (y, count + 1),
             direction=True,

@@ -60,7 +60,7 @@ def semi(f, g, y0=None):
 
 
 def event(condition, jump=None, **more):
-    return lambda: solve(event=diffrax.Event(condition) if jump is None else D.Jump(condition, jump, **more))
+    return lambda: solve(event=diffrax.Event(condition) if jump is None else D.Reset(condition, jump, **more))
 
 
 def steps(controller, solver=PROJECTED, dt0=None):
@@ -201,22 +201,22 @@ METHODS = {
 
 
 EVENTS = {
-    "a function": (given(event=level), "`event` must be a diffrax.Event(condition), which ends the solve, or a dae_jax.Jump(condition, jump), after which it goes on, but is the function level."),
-    "a class": (given(event=D.Jump), "but is the class Jump: write Jump(...)."),
+    "a function": (given(event=level), "`event` must be a diffrax.Event(condition), which ends the solve, or a dae_jax.Reset(condition, reset), after which it goes on, but is the function level."),
+    "a class": (given(event=D.Reset), "but is the class Reset: write Reset(...)."),
     "Event without keywords": (event(lambda t, y, a: y[0][0]), "`condition(t, y, args, **kwargs)` must take these arguments, but the function given takes (t, y, a)"),
     "Event of a vector": (event(lambda t, y, a, **k: y[0]), "`condition(t, y, args, **kwargs)` must return a real number, whose zero is the event, but returns float64[2]."),
     "Event of an integer": (event(lambda t, y, a, **k: 1), "must return a real number, whose zero is the event, but returns int64[]."),
     "root finder in words": (lambda: solve(event=diffrax.Event(level, "newton")), "`root_finder` of diffrax.Event must be a root finder such as optimistix.Newton(1e-8, 1e-8), but is 'newton'."),
-    "Jump without keywords": (event(lambda t, y, a: y[0][0], kept), "`condition(t, y, args, **kwargs)` must take these arguments, but the function given takes (t, y, a): write `def condition(t, y, args, **kwargs): ...`."),
-    "Jump on None": (event(lambda t, y, a, **k: None, kept), "must return a real number, whose zero is the event, but returns None."),
-    "jump to y alone": (event(level, lambda t, y, a: y), "`jump(t, y, args)` must return (y, args), the state and the args to go on with, ((float64[2], float64[2]), None), but returns (float64[2], float64[2])."),
-    "jump to None": (event(level, lambda t, y, a: None), "`jump(t, y, args)` must return (y, args)"),
+    "Reset without keywords": (event(lambda t, y, a: y[0][0], kept), "`condition(t, y, args, **kwargs)` must take these arguments, but the function given takes (t, y, a): write `def condition(t, y, args, **kwargs): ...`."),
+    "Reset on None": (event(lambda t, y, a, **k: None, kept), "must return a real number, whose zero is the event, but returns None."),
+    "jump to y alone": (event(level, lambda t, y, a: y), "`reset(t, y, args)` must return (y, args), the state and the args to go on with, ((float64[2], float64[2]), None), but returns (float64[2], float64[2])."),
+    "jump to None": (event(level, lambda t, y, a: None), "`reset(t, y, args)` must return (y, args)"),
     "jump to other args": (event(level, lambda t, y, a: (y, 1.0)), "but returns ((float64[2], float64[2]), float64[])."),
     "jump to another shape": (event(level, lambda t, y, a: ((y[0], jnp.zeros(3)), a)), "but returns ((float64[2], float64[3]), None)."),
-    "jump of y alone": (event(level, lambda y: (y, None)), "`jump(t, y, args)` must take these arguments, but the function given takes (y)"),
-    "no condition": (event(0.9, kept), "`condition` of Jump must be a function, but is 0.9."),
-    "most of 0": (event(level, kept, most=0), "`most` of Jump must be an integer of at least 1, but is 0."),
-    "direction of -1": (event(level, kept, direction=-1), "`direction` of Jump must be True for upcrossings, False for downcrossings or None for both, but is -1."),
+    "jump of y alone": (event(level, lambda y: (y, None)), "`reset(t, y, args)` must take these arguments, but the function given takes (y)"),
+    "no condition": (event(0.9, kept), "`condition` of Reset must be a function, but is 0.9."),
+    "max_resets of 0": (event(level, kept, max_resets=0), "`max_resets` of Reset must be an integer of at least 1, but is 0."),
+    "direction of -1": (event(level, kept, direction=-1), "`direction` of Reset must be True for upcrossings, False for downcrossings or None for both, but is -1."),
     "fixed for all": (event(level, kept, fixed=True), "`fixed` must hold booleans in the structure of the state, (float64[2], float64[2]), but is bool[]."),
 }  # fmt: skip
 

@@ -54,7 +54,7 @@ def test_a_jump_off_a_surface_that_a_dummy_derivative_leaves(solver):
     height, m = 0.9, 0.5
     amplitude = np.arcsin(np.sin(np.arccos(height) / 2) / np.sqrt(m))
     fall = (ellipk(m) - ellipkinc(amplitude, m)) / np.sqrt(9.81)
-    bounce = dae_jax.Jump(lambda t, y, args, **_: y[0][1] - height, lambda t, y, args: ((y[0], -y[1]), args))
+    bounce = dae_jax.Reset(lambda t, y, args, **_: y[0][1] - height, lambda t, y, args: ((y[0], -y[1]), args))
     y0 = (np.array([1.0, 0.0]), np.zeros(2))
     sol = solved(PENDULUM.system, solver, 6 * fall, y0, 1e-8, event=bounce)
     assert sol.stats["jumps"] == 3

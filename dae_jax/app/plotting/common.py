@@ -5,9 +5,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from jax import Array
 
 
-Curves = Mapping[str, tuple[np.ndarray, np.ndarray]]
+Numbers = np.ndarray | Array
+Curves = Mapping[str, tuple[Numbers, Numbers]]
 
 # Okabe and Ito's colours, told apart by colour-blind readers too; markers tell apart what shares a colour or a line.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -40,7 +42,7 @@ BLANK = "#DDDDDD"
 FILE_TYPES = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".eps", ".ps", ".tif", ".tiff", ".webp")
 
 
-def saved(times: Any, *values: Any) -> tuple[np.ndarray, ...]:
+def saved(times: Numbers, *values: Numbers) -> tuple[np.ndarray, ...]:
     """Times and what belongs to them without the padding of a solve that ended early or saved its steps."""
     kept = np.isfinite(np.asarray(times))
     return tuple(np.asarray(x)[kept] for x in (times, *values))

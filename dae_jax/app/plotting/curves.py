@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import PyTree
 
 from .common import COLOURS, GREY, Curves, figure_of, legend_below, legend_beside, look, saved
 
@@ -154,7 +155,7 @@ def tuning(history: Any, title: str = "Descent") -> Any:
     return figure
 
 
-def _leaves(tree: Any) -> list[tuple[str, Any]]:
+def _leaves(tree: PyTree) -> list[tuple[str, Any]]:
     """The leaves of a pytree with their names."""
     import jax
 

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from ...analyse import Structure
 from .common import BLANK, COLOURS, figure_of, legend_below
 
 
@@ -11,7 +12,7 @@ from .common import BLANK, COLOURS, figure_of, legend_below
 NAMED = 40
 
 
-def incidence(structure: Any, title: str = "Incidence") -> Any:
+def incidence(structure: Structure, title: str = "Incidence") -> Any:
     """Which variable occurs in which equation of an `analyse`d system: light where it occurs itself, dark where its
     derivative does; framed are the pairs of the transversal, and the labels give the offsets c and d.
     """

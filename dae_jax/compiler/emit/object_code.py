@@ -3,12 +3,15 @@
 import hashlib
 import importlib.metadata
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..jaxprs.scalar_interpreter import Unsupported
 from .interface import VERSION
 from .target import Target, llvm
 
+
+if TYPE_CHECKING:
+    from llvmlite.binding import ModuleRef, TargetMachine
 
 # Of LLVM's passes. Without the vectorisation of straight-line code: it gains nothing here, and LLVM 22.1 breaks some
 # functions by it; with that of loops.
@@ -56,7 +59,7 @@ def parsed(text: str) -> Any:
     return module
 
 
-def _optimise(module: Any, machine: Any) -> None:
+def _optimise(module: "ModuleRef", machine: "TargetMachine") -> None:
     tuning = llvm().create_pipeline_tuning_options(speed_level=SPEED)
     tuning.slp_vectorization, tuning.loop_vectorization = BY_VECTORS
     passes = llvm().create_pass_builder(machine, tuning)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+from jaxtyping import Array
 
 from ..settings import THREADS, current
 from . import object_cache
@@ -46,7 +47,7 @@ class _Program:
         return ctypes.c_int64.from_address(self.slot + 16).value
 
 
-def register(module: str, source: Any = "") -> str:
+def register(module: str, source: object = "") -> str:
     """Compiles a module with a function `{name}.kernel`, and gives the name by which XLA calls it.
 
     `source` is what the module was written from, for people to read.
@@ -81,7 +82,7 @@ def guarded(fn: Callable[..., Any]) -> Callable[..., Any]:
     """`fn`, in one thread at a time."""
 
     @functools.wraps(fn)
-    def call(*args: Any) -> Any:
+    def call(*args: Array) -> Any:
         with _lock:
             return fn(*args)
 
@@ -98,9 +99,12 @@ def compiled(text: str, target: Target, passes: bool = True) -> bytes:
     return code
 
 
-def _dump(text: str, target: Target, name: str, source: Any) -> None:
+def _dump(text: str, target: Target, name: str, source: object) -> None:
     """Writes a module, what it was written from, what LLVM's passes make of it, and its assembly to the settings' folder."""
-    show = lambda suffix, text: Path(current().dump or "", f"{name}.{suffix}").write_text(text)
+
+    def show(suffix: str, text: str) -> None:
+        Path(current().dump or "", f"{name}.{suffix}").write_text(text)
+
     show("jaxpr", str(source))
     show("ll", text)
     object_code(text, target, show=show)

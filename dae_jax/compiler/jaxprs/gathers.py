@@ -1,6 +1,7 @@
 """Which entries a gather reads and a scatter writes, found without JAX: an operation on numbers would be compiled for each shape."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -9,7 +10,11 @@ from jaxtyping import Int
 
 
 def gathered(
-    places: Int[np.ndarray, "..."], indices: Int[np.ndarray, "..."], numbers: Any, slice_sizes: Any, mode: Any
+    places: Int[np.ndarray, "..."],
+    indices: Int[np.ndarray, "..."],
+    numbers: jax.lax.GatherDimensionNumbers,
+    slice_sizes: Sequence[int],
+    mode: jax.lax.GatherScatterMode | str | None,
 ) -> Int[np.ndarray, "..."]:
     """`jax.lax.gather(places, indices, numbers, slice_sizes, mode=mode, fill_value=-1)` on numbers."""
     shape, sizes = np.array(places.shape, int), np.array(slice_sizes, int)
@@ -32,21 +37,27 @@ def gathered(
 
 
 def scattered(
-    places: Int[np.ndarray, "..."], indices: Int[np.ndarray, "..."], shape: tuple[int, ...], numbers: Any, mode: Any
+    places: Int[np.ndarray, "..."],
+    indices: Int[np.ndarray, "..."],
+    shape: tuple[int, ...],
+    numbers: jax.lax.ScatterDimensionNumbers,
+    mode: jax.lax.GatherScatterMode | str | None,
 ) -> Int[np.ndarray, "..."]:
     """Where `jax.lax.scatter` puts each of the updates, which have this shape; −1: nowhere."""
     return gathered(places, indices, *windows(places.shape, shape, numbers), mode)
 
 
-def windows(operand: tuple[int, ...], updates: tuple[int, ...], numbers: Any) -> tuple[Any, tuple[int, ...]]:
+def windows(
+    operand: tuple[int, ...], updates: tuple[int, ...], numbers: jax.lax.ScatterDimensionNumbers
+) -> tuple[Any, tuple[int, ...]]:
     """The gather that reads what a scatter writes: its dimension numbers and slice sizes."""
     sizes = iter([updates[axis] for axis in numbers.update_window_dims])
     outside = {*numbers.inserted_window_dims, *numbers.operand_batching_dims}
     inverse = jax.lax.GatherDimensionNumbers(
-        offset_dims=numbers.update_window_dims,
-        collapsed_slice_dims=numbers.inserted_window_dims,
-        start_index_map=numbers.scatter_dims_to_operand_dims,
-        operand_batching_dims=numbers.operand_batching_dims,
-        start_indices_batching_dims=numbers.scatter_indices_batching_dims,
+        offset_dims=tuple(numbers.update_window_dims),
+        collapsed_slice_dims=tuple(numbers.inserted_window_dims),
+        start_index_map=tuple(numbers.scatter_dims_to_operand_dims),
+        operand_batching_dims=tuple(numbers.operand_batching_dims),
+        start_indices_batching_dims=tuple(numbers.scatter_indices_batching_dims),
     )
     return inverse, tuple(1 if axis in outside else next(sizes) for axis in range(len(operand)))

@@ -6,7 +6,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
+from jaxtyping import Array
 
+from ..types import Atom, Aval, Equation, Params, aval_of
 from .special_functions import SPECIAL, by_simpler_ones
 from .walk import called, of_solve
 
@@ -44,7 +46,7 @@ class _Flat:
         self.constants: dict[int, tuple[Var, Any]] = {}
         self._known: dict[Hashable, list[Any]] = {}
 
-    def run(self, closed: ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
+    def run(self, closed: ClosedJaxpr, args: Sequence[Atom]) -> list[Any]:
         """Writes down the equations of a jaxpr; gives the variables of its results."""
         env: dict[Any, Any] = dict(zip(closed.jaxpr.invars, args, strict=True))
         for v, x in zip(closed.jaxpr.constvars, closed.consts, strict=True):
@@ -54,7 +56,7 @@ class _Flat:
             env.update(zip(eqn.outvars, self._equation(eqn, list(map(read, eqn.invars))), strict=True))
         return list(map(read, closed.jaxpr.outvars))
 
-    def _equation(self, eqn: JaxprEqn, args: list[Any]) -> list[Any]:
+    def _equation(self, eqn: JaxprEqn, args: list[Atom]) -> list[Any]:
         name, p = eqn.primitive.name, eqn.params
         inner = called(eqn)
         if inner is not None:
@@ -66,11 +68,11 @@ class _Flat:
         if name == "custom_linear_solve":
             return self.run(p["jaxprs"].solve, of_solve(p, args))
         if name in _BY_OTHERS:
-            scalar = name != "maybe_set" and not args[0].aval.ndim
+            scalar = name != "maybe_set" and not aval_of(args[0]).ndim
             return args[:1] if scalar else self.run(_meaning(eqn), args)
         if name == "while" and eqn.params["cond_jaxpr"].out_avals[0].shape:
             eqn, args = _until_all_are_done(eqn, args)
-        if name in _SAME_IF_SO_SHAPED and _like(args[0].aval, eqn.outvars[0].aval):
+        if name in _SAME_IF_SO_SHAPED and _like(aval_of(args[0]), aval_of(eqn.outvars[0])):
             return args[:1]
         atoms = [_atom(x) for x in args]
         key = (name, _key(eqn.params), frozenset(atoms) if name in _COMMUTATIVE else tuple(atoms))
@@ -81,22 +83,22 @@ class _Flat:
         return found
 
 
-def _until_all_are_done(eqn: JaxprEqn, args: list[Any]) -> tuple[JaxprEqn, list[Any]]:
+def _until_all_are_done(eqn: JaxprEqn, args: list[Atom]) -> tuple[JaxprEqn, list[Any]]:
     """A loop with a condition for each of several elements, as `vmap` makes it: what is done stays as it is."""
     p = eqn.params
     n, m = p["cond_nconsts"], p["body_nconsts"]
     condition, body = map(jaxpr_as_fun, (p["cond_jaxpr"], p["body_jaxpr"]))
 
-    def any_goes_on(*xs: Any) -> Any:
+    def any_goes_on(*xs: Array) -> Any:
         return jnp.any(condition(*xs)[0])
 
-    def turn(*xs: Any) -> list[Any]:
+    def turn(*xs: Array) -> list[Any]:
         carry = xs[n + m :]
         (goes_on,) = condition(*xs[:n], *carry)
         here = lambda x: jax.lax.broadcast_in_dim(goes_on, x.shape, range(goes_on.ndim))
         return [jax.lax.select(here(x), y, x) for x, y in zip(carry, body(*xs[n:]), strict=True)]
 
-    structs = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in args]
+    structs = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in map(aval_of, args)]
     params = {
         **p,
         "cond_jaxpr": jax.make_jaxpr(any_goes_on)(*structs[:n], *structs[n + m :]),
@@ -106,11 +108,11 @@ def _until_all_are_done(eqn: JaxprEqn, args: list[Any]) -> tuple[JaxprEqn, list[
     return eqn.replace(params=params), [*args[:n], *args]
 
 
-def _like(a: Any, b: Any) -> bool:
+def _like(a: Aval, b: Aval) -> bool:
     return a.shape == b.shape and a.dtype == b.dtype
 
 
-def _key(params: Any) -> Hashable:
+def _key(params: Params) -> Hashable:
     key = tuple(sorted(params.items()))
     try:
         hash(key)
@@ -119,12 +121,12 @@ def _key(params: Any) -> Hashable:
     return key
 
 
-def _atom(x: Any) -> Hashable:
+def _atom(x: Atom) -> Hashable:
     # By its text: 0 and −0 are equal, and not the same.
-    return (repr(x.val), x.aval.dtype) if isinstance(x, Literal) else x
+    return (repr(x.val), aval_of(x).dtype) if isinstance(x, Literal) else x
 
 
-def _meaning(eqn: Any) -> ClosedJaxpr:
+def _meaning(eqn: Equation) -> ClosedJaxpr:
     """A primitive of equinox by others."""
     structs = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
     return jax.make_jaxpr(lambda *xs: eqn.primitive.impl(*xs, **eqn.params))(*structs)

@@ -1,10 +1,11 @@
 """Primitives that move entries about, on arrays of entries of any kind."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
+from ..types import Equation
 from .gathers import gathered, scattered
 from .objects import as_indices, objects
 
@@ -12,17 +13,17 @@ from .objects import as_indices, objects
 Entries = np.ndarray
 
 
-def reshape(eqn: Any, x: Entries) -> Entries:
+def reshape(eqn: Equation, x: Entries) -> Entries:
     """Also `squeeze` and `expand_dims`."""
     return x.reshape(eqn.outvars[0].aval.shape)
 
 
-def copy(_: Any, x: Entries) -> Entries:
+def copy(_: object, x: Entries) -> Entries:
     """The same entries."""
     return x
 
 
-def broadcast_in_dim(eqn: Any, x: Entries) -> Entries:
+def broadcast_in_dim(eqn: Equation, x: Entries) -> Entries:
     """Entries at several indices."""
     shape, inner = eqn.params["shape"], [1] * len(eqn.params["shape"])
     for size, dimension in zip(x.shape, eqn.params["broadcast_dimensions"], strict=True):
@@ -30,50 +31,50 @@ def broadcast_in_dim(eqn: Any, x: Entries) -> Entries:
     return np.broadcast_to(x.reshape(inner), shape)
 
 
-def transpose(eqn: Any, x: Entries) -> Entries:
+def transpose(eqn: Equation, x: Entries) -> Entries:
     """Axes in another order."""
     return np.transpose(x, eqn.params["permutation"])
 
 
-def tile(eqn: Any, x: Entries) -> Entries:
+def tile(eqn: Equation, x: Entries) -> Entries:
     """The array repeated along its axes."""
     return np.tile(x, eqn.params["reps"])
 
 
-def rev(eqn: Any, x: Entries) -> Entries:
+def rev(eqn: Equation, x: Entries) -> Entries:
     """Axes from their end."""
     return np.flip(x, eqn.params["dimensions"])
 
 
-def slice_(eqn: Any, x: Entries) -> Entries:
+def slice_(eqn: Equation, x: Entries) -> Entries:
     """A part of the array."""
     p = eqn.params
     strides = p["strides"] or (1,) * x.ndim
     return x[tuple(map(slice, p["start_indices"], p["limit_indices"], strides))]
 
 
-def split(eqn: Any, x: Entries) -> list[Entries]:
+def split(eqn: Equation, x: Entries) -> list[Entries]:
     """Pieces along an axis."""
     return np.split(x, np.cumsum(eqn.params["sizes"])[:-1], axis=eqn.params["axis"])
 
 
-def unstack(eqn: Any, x: Entries) -> list[Entries]:
+def unstack(eqn: Equation, x: Entries) -> list[Entries]:
     """The entries along an axis."""
     pieces = np.split(x, len(eqn.outvars), eqn.params["axis"])
     return [piece.reshape(v.aval.shape) for piece, v in zip(pieces, eqn.outvars, strict=True)]
 
 
-def stack(eqn: Any, *xs: Entries) -> Entries:
+def stack(eqn: Equation, *xs: Entries) -> Entries:
     """Arrays along a new axis."""
     return np.stack(xs, axis=eqn.params["axis"])
 
 
-def concatenate(eqn: Any, *xs: Entries) -> Entries:
+def concatenate(eqn: Equation, *xs: Entries) -> Entries:
     """Arrays one after another along an axis."""
     return np.concatenate(xs, axis=eqn.params["dimension"])
 
 
-def iota(eqn: Any) -> Entries:
+def iota(eqn: Equation) -> Entries:
     """Indices along an axis."""
     shape, dimension = eqn.params["shape"], eqn.params["dimension"]
     along = np.arange(shape[dimension]).astype(eqn.params["dtype"])
@@ -82,7 +83,7 @@ def iota(eqn: Any) -> Entries:
     )
 
 
-def pad(eqn: Any, x: Entries, fill: Entries) -> Entries:
+def pad(eqn: Equation, x: Entries, fill: Entries) -> Entries:
     """Something else around the entries and between them; of a negative width that many entries are left out."""
     config = eqn.params["padding_config"]
     around = [(max(low, 0), max(high, 0)) for low, high, _ in config]
@@ -104,25 +105,25 @@ MOVEMENTS: dict[str, Callable[..., Any]] = {
 }  # fmt: skip
 
 
-def windows_start(starts: Any, shape: Any, sizes: Any) -> list[int]:
+def windows_start(starts: Sequence[np.ndarray], shape: Sequence[int], sizes: Sequence[int]) -> list[int]:
     """Where a window with known starts begins: moved inside the array."""
     return [min(max(int(s[()]), 0), n - k) for s, n, k in zip(starts, shape, sizes, strict=True)]
 
 
-def dynamic_slice(eqn: Any, x: Entries, *starts: Entries) -> Entries:
+def dynamic_slice(eqn: Equation, x: Entries, *starts: Entries) -> Entries:
     """A window at a known place."""
     sizes = eqn.params["slice_sizes"]
     return x[tuple(slice(s, s + k) for s, k in zip(windows_start(starts, x.shape, sizes), sizes, strict=True))]
 
 
-def dynamic_update_slice(_: Any, x: Entries, update: Entries, *starts: Entries) -> Entries:
+def dynamic_update_slice(_: object, x: Entries, update: Entries, *starts: Entries) -> Entries:
     """The array with a window at a known place replaced."""
     out, first = x.copy(), windows_start(starts, x.shape, update.shape)
     out[tuple(slice(s, s + k) for s, k in zip(first, update.shape, strict=True))] = update
     return out
 
 
-def gather(eqn: Any, x: Entries, indices: Entries) -> Entries:
+def gather(eqn: Equation, x: Entries, indices: Entries) -> Entries:
     """Entries at known places; what is outside of the array is the fill value."""
     p, dtype = eqn.params, np.dtype(eqn.outvars[0].aval.dtype)
     places = np.arange(x.size).reshape(x.shape)
@@ -131,14 +132,14 @@ def gather(eqn: Any, x: Entries, indices: Entries) -> Entries:
     return objects([flat[place] if place >= 0 else fill for place in moved.ravel()], moved.shape)
 
 
-def fill_of(value: Any, dtype: np.dtype) -> Any:
+def fill_of(value: complex | None, dtype: np.dtype) -> Any:
     """What a gather gives outside of the array."""
     if value is None and dtype.kind in "iub":
         value = True if dtype.kind == "b" else np.iinfo(dtype).min if dtype.kind == "i" else np.iinfo(dtype).max
     return dtype.type(np.nan if value is None else value)
 
 
-def scatter(eqn: Any, x: Entries, indices: Entries, updates: Entries, combine: Callable[..., Any]) -> Entries:
+def scatter(eqn: Equation, x: Entries, indices: Entries, updates: Entries, combine: Callable[..., object]) -> Entries:
     """The array with `combine(before, update)` at known places; what is outside of the array is left out."""
     p, places = eqn.params, np.arange(x.size).reshape(x.shape)
     moved = scattered(places, as_indices(indices), updates.shape, p["dimension_numbers"], p["mode"])

@@ -2,10 +2,14 @@
 
 import functools
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+
+from ..types import DType, Equation
 
 
 _EXACT = {
@@ -24,10 +28,10 @@ def _lgamma(x: float) -> float:
 _OF_FLOATS = {"div": np.divide, "exp": np.exp, "lgamma": _lgamma}
 
 
-def converted(x: Any, dtype: Any) -> Any:
+def converted(x: ArrayLike, dtype: DType) -> Any:
     """Numbers as ones of another type, as XLA has it: into integers to the nearest there is, what is undefined to 0."""
     x, dtype = np.asarray(x), np.dtype(dtype)
-    x = x.real if dtype.kind != "c" else x
+    x = np.real(x) if dtype.kind != "c" else x
     with np.errstate(all="ignore"):
         if x.dtype.kind != "f" or dtype.kind not in "iu":
             return x.astype(dtype)[()]
@@ -38,7 +42,7 @@ def converted(x: Any, dtype: Any) -> Any:
         return np.where(inside, np.where(inside, x, 0).astype(dtype), limits)[()]
 
 
-def on_numbers(eqn: Any, values: list[Any]) -> np.ndarray | None:
+def on_numbers(eqn: Equation, values: Sequence[np.ndarray]) -> np.ndarray | None:
     """What an equation of a jaxpr with one output gives for numbers; `None` where numpy may see that differently."""
     function = _of_numbers(eqn)
     if function is None:
@@ -47,12 +51,12 @@ def on_numbers(eqn: Any, values: list[Any]) -> np.ndarray | None:
         return np.asarray(function(*values), eqn.outvars[0].aval.dtype)
 
 
-def is_on_numbers(eqn: Any) -> bool:
+def is_on_numbers(eqn: Equation) -> bool:
     """Whether `on_numbers` gives something."""
     return _of_numbers(eqn) is not None
 
 
-def _of_numbers(eqn: Any) -> Any:
+def _of_numbers(eqn: Equation) -> Any:
     name = eqn.primitive.name
     if name in _OF_FLOATS and jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.floating):
         return _OF_FLOATS[name]

@@ -1,12 +1,17 @@
 """Arrays of entries: numpy arrays of objects, each of them a number where that is known."""
 
 import math
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, TypeGuard, overload
 
 import numpy as np
 
 
-def objects(entries: Any, shape: tuple[int, ...]) -> np.ndarray:
+if TYPE_CHECKING:
+    from typing_extensions import TypeIs
+
+
+def objects(entries: Sequence[object], shape: tuple[int, ...]) -> np.ndarray:
     """A list as an array of objects."""
     out = np.empty(len(entries), dtype=object)
     for i, entry in enumerate(entries):  # `out[:] = entries` would ask traced entries for their values
@@ -14,7 +19,15 @@ def objects(entries: Any, shape: tuple[int, ...]) -> np.ndarray:
     return out.reshape(shape)
 
 
-def is_number(x: Any, *which: float) -> bool:
+@overload
+def is_number(x: object) -> "TypeIs[np.number]": ...
+
+
+@overload
+def is_number(x: object, *which: float) -> "TypeGuard[np.number]": ...
+
+
+def is_number(x: object, *which: float) -> bool:
     """Whether an entry is known while tracing, and one of `which` where these are given."""
     return isinstance(x, np.generic) and (not which or any(x == value for value in which))
 

@@ -11,7 +11,9 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Array, PyTree
 
+from ..types import Equation
 from .objects import is_number, objects
 from .scalar_interpreter import ScalarInterpreter, Unsupported
 
@@ -25,9 +27,10 @@ POWER = 4
 
 # Coefficients of monomials; a monomial is a sorted tuple of unknowns.
 Polynomial = dict[tuple[int, ...], float]
+Entry = Polynomial | np.number
 
 
-def polynomials(fn: Callable[..., Any], *args: Any) -> np.ndarray | None:
+def polynomials(fn: Callable[..., Any], *args: PyTree) -> np.ndarray | None:
     """The numbers of `fn(*args)`, a single array, as an array of polynomials. `args` give shapes only.
 
     `None` where a primitive has no such form or there is too much to do.
@@ -43,13 +46,13 @@ def polynomials(fn: Callable[..., Any], *args: Any) -> np.ndarray | None:
     return objects([_polynomial(x) for x in out.ravel()], out.shape)
 
 
-def _polynomial(x: Any) -> Polynomial:
+def _polynomial(x: Entry) -> Polynomial:
     if is_number(x):
         return {(): float(x)} if x != 0 else {}
     return x
 
 
-class _Polynomials(ScalarInterpreter):
+class _Polynomials(ScalarInterpreter[Entry]):
     """Each entry that is not known is a `Polynomial`."""
 
     def __init__(self, limit: int) -> None:
@@ -63,14 +66,14 @@ class _Polynomials(ScalarInterpreter):
         """The unknown of this name, the same one for the same name."""
         return {(self.known.setdefault(name, len(self.known)),): 1.0}
 
-    def traced(self, x: Any) -> np.ndarray:
+    def traced(self, x: Array) -> np.ndarray:
         return self.unknowns(("traced", id(x)), x.shape)
 
-    def opaque(self, eqn: Any, args: list[np.ndarray]) -> list[np.ndarray]:
+    def opaque(self, eqn: Equation, args: list[np.ndarray]) -> list[np.ndarray]:
         called = ("call", len(self.known))
         return [self.unknowns((called, i), v.aval.shape) for i, v in enumerate(eqn.outvars)]
 
-    def apply(self, eqn: Any, x: list[Any]) -> Any:
+    def apply(self, eqn: Equation, x: list[Entry]) -> Any:
         self.operations += 1
         name, params, dtype = eqn.primitive.name, eqn.params, eqn.outvars[0].aval.dtype
         if np.issubdtype(dtype, np.complexfloating):
@@ -92,10 +95,10 @@ class _Polynomials(ScalarInterpreter):
                 return x[0]
         return self.function(eqn, x)
 
-    def function(self, eqn: Any, x: list[Any]) -> Polynomial:
+    def function(self, eqn: Equation, x: list[Entry]) -> Polynomial:
         return self.unknown((eqn.primitive.name, str(eqn.params), *map(_key, x)))
 
-    def inverse(self, a: Any) -> Any:
+    def inverse(self, a: Entry) -> Any:
         if is_number(a):
             return 1 / a
         if len(a) == 1:
@@ -103,14 +106,14 @@ class _Polynomials(ScalarInterpreter):
             return self.scaled(self.unknown(("inverse", monomial)), 1 / factor)
         return self.unknown(("inverse", _key(a)))
 
-    def product(self, a: Any, b: Any) -> Any:
+    def product(self, a: Entry, b: Entry) -> Any:
         self.operations += 1
         if is_number(a) and is_number(b):
             return a * b
         if is_number(a):
-            return self.scaled(b, a)
+            return self.scaled(_polynomial(b), a)
         if is_number(b):
-            return self.scaled(a, b)
+            return self.scaled(_polynomial(a), b)
         if len(a) * len(b) > TERMS:
             return self.unknown(("mul", *sorted((_key(a), _key(b)))))
         found: Any = {}
@@ -118,10 +121,10 @@ class _Polynomials(ScalarInterpreter):
             found = self.total(found, {tuple(sorted(left + right)): c * d for right, d in b.items()})
         return found
 
-    def scaled(self, a: Polynomial, factor: Any) -> Any:
+    def scaled(self, a: Polynomial, factor: np.generic | float) -> Any:
         return {monomial: float(factor) * c for monomial, c in a.items()} if factor != 0 else np.float64(0)
 
-    def total(self, a: Any, b: Any) -> Any:
+    def total(self, a: Entry, b: Entry) -> Any:
         self.operations += 1
         if is_number(a) and is_number(b):
             return a + b
@@ -134,12 +137,12 @@ class _Polynomials(ScalarInterpreter):
                 del found[monomial]
         return found
 
-    def negative(self, a: Any) -> Any:
+    def negative(self, a: Entry) -> Any:
         return -a if is_number(a) else self.scaled(a, -1)
 
-    def larger(self, a: Any, b: Any) -> Any:
+    def larger(self, a: Entry, b: Entry) -> Any:
         return self.unknown(("max", *sorted((_key(a), _key(b)))))
 
 
-def _key(x: Any) -> tuple[Any, ...]:
+def _key(x: Entry) -> tuple[Any, ...]:
     return tuple(sorted(_polynomial(x).items()))

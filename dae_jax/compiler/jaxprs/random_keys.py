@@ -6,8 +6,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, Literal
+from jaxtyping import Array
 
 from .._compat import is_key, key_functions
+from ..types import Arrays, Aval, Equation
 from .walk import equations, equations_in
 
 
@@ -24,13 +26,13 @@ def _converted(closed: ClosedJaxpr) -> ClosedJaxpr:
     return jax.make_jaxpr(lambda *xs: _run(closed, xs))(*(_struct(v.aval) for v in closed.jaxpr.invars))
 
 
-def _struct(aval: Any) -> jax.ShapeDtypeStruct:
+def _struct(aval: Aval) -> jax.ShapeDtypeStruct:
     if not is_key(aval):
         return jax.ShapeDtypeStruct(aval.shape, aval.dtype)
     return jax.ShapeDtypeStruct((*aval.shape, *key_functions(aval.dtype).key_shape), jnp.uint32)
 
 
-def _run(closed: ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
+def _run(closed: ClosedJaxpr, args: Sequence[Array]) -> list[Any]:
     jaxpr = closed.jaxpr
     env: dict[Any, Any] = dict(zip(jaxpr.invars, args, strict=True))
     for v, x in zip(jaxpr.constvars, closed.consts, strict=True):
@@ -41,7 +43,7 @@ def _run(closed: ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
     return list(map(read, jaxpr.outvars))
 
 
-def _equation(eqn: Any, args: list[Any]) -> list[Any]:
+def _equation(eqn: Equation, args: Arrays) -> list[Any]:
     name, keyed = eqn.primitive.name, any(is_key(v.aval) for v in (*eqn.invars, *eqn.outvars))
     if name in _OF_KEYS:
         return [_OF_KEYS[name](eqn, *args)]
@@ -56,13 +58,13 @@ def _equation(eqn: Any, args: list[Any]) -> list[Any]:
     return list(found) if eqn.primitive.multiple_results else [found]
 
 
-def _has_key(eqn: Any) -> bool:
+def _has_key(eqn: Equation) -> bool:
     return any(is_key(v.aval) for v in (*eqn.invars, *eqn.outvars))
 
 
-def _with_jaxprs(eqn: Any, args: list[Any]) -> list[Any]:
+def _with_jaxprs(eqn: Equation, args: Arrays) -> list[Any]:
     """An equation whose jaxprs have keys, with these converted."""
-    changed = {k: _converted(p) for k, p in eqn.params.items() if isinstance(p, ClosedJaxpr)}
+    changed: dict[str, Any] = {k: _converted(p) for k, p in eqn.params.items() if isinstance(p, ClosedJaxpr)}
     if "branches" in eqn.params:
         changed["branches"] = tuple(map(_converted, eqn.params["branches"]))
     if eqn.primitive.name in ("while", "scan", "cond"):
@@ -71,14 +73,14 @@ def _with_jaxprs(eqn: Any, args: list[Any]) -> list[Any]:
     return _run(inner, args)
 
 
-def _each(eqn: Any, fn: Callable[..., Any], *args: Any) -> Any:
+def _each(eqn: Equation, fn: Callable[..., Any], *args: Array) -> Any:
     """A function of one key, of all keys of an array."""
     for _ in range(eqn.invars[0].aval.ndim):
         fn = jax.vmap(fn)
     return fn(*args)
 
 
-def _functions(eqn: Any) -> Any:
+def _functions(eqn: Equation) -> Any:
     return key_functions(next(v.aval.dtype for v in (*eqn.invars, *eqn.outvars) if is_key(v.aval)))
 
 

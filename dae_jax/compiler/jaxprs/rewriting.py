@@ -4,8 +4,11 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
-from jax.extend.core import ClosedJaxpr, Literal
+from jax.core import Tracer
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jaxtyping import Array
 
+from ..types import Arrays, Equation, Params
 from .scalar_interpreter import Unsupported
 from .walk import CALLS, WITH_DERIVATIVE, called, equations, equations_in, of_solve
 
@@ -25,11 +28,13 @@ class Rewriting:
         self,
         applies: Callable[[Any], bool],
         replacement: Callable[[Any, list[Any], list[Any]], tuple[list[Any], list[Any]]],
-        stops: Callable[[list[Any]], Any] | None = None,
+        stops: Callable[[Arrays], Array] | None = None,
     ) -> None:
         self._applies, self._replacement, self._stops = applies, replacement, stops
 
-    def run(self, jaxpr: Any, consts: Any, args: Sequence[Any], state: list[Any]) -> tuple[list[Any], list[Any]]:
+    def run(
+        self, jaxpr: Jaxpr, consts: Sequence[Array], args: Sequence[Array], state: Arrays
+    ) -> tuple[list[Any], list[Any]]:
         """The results of a jaxpr, and the state after it."""
         env = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *args], strict=True))
         read = lambda v: v.val if isinstance(v, Literal) else env[v]
@@ -38,11 +43,11 @@ class Rewriting:
             env.update(zip(eqn.outvars, results, strict=True))
         return list(map(read, jaxpr.outvars)), state
 
-    def _equation(self, eqn: Any, args: list[Any], state: list[Any]) -> tuple[list[Any], list[Any]]:
+    def _equation(self, eqn: Equation, args: Arrays, state: Arrays) -> tuple[list[Any], list[Any]]:
         name, p = eqn.primitive.name, eqn.params
         if self._applies(eqn):
             return self._replacement(eqn, args, state)
-        if name == "cond" and not isinstance(args[0], jax.core.Tracer):
+        if name == "cond" and not isinstance(args[0], Tracer):
             branch = p["branches"][int(args[0])]
             return self.run(branch.jaxpr, branch.consts, args[1:], state)
         if not any(map(self._applies, equations_in(eqn))):
@@ -69,14 +74,14 @@ class Rewriting:
         n = len(closed.jaxpr.invars)
         return lambda *xs: [y for ys in self.run(closed.jaxpr, closed.consts, xs[:n], list(xs[n:])) for y in ys]
 
-    def _while(self, eqn: Any, args: list[Any], state: list[Any]) -> list[Any]:
+    def _while(self, eqn: Equation, args: Arrays, state: Arrays) -> list[Any]:
         p, count = eqn.params, len(state)
         n, condition = p["cond_nconsts"], p["cond_jaxpr"]
         changes = any(map(self._applies, equations(condition)))
         if state and (changes or condition.out_avals[0].shape):
             raise Unsupported("a check in the condition of a loop, or in a loop with several conditions")
 
-        def goes_on(*xs: Any) -> Any:
+        def goes_on(*xs: Array) -> Any:
             (found,), _ = self.run(condition.jaxpr, condition.consts, xs[: len(xs) - count], [])
             return found & ~self._stops(list(xs[len(xs) - count :])) if self._stops and state else found
 
@@ -89,10 +94,10 @@ class Rewriting:
         }
         return eqn.primitive.bind(*args, *state, **params)
 
-    def _scan(self, p: Any, args: list[Any], state: list[Any]) -> tuple[list[Any], list[Any]]:
+    def _scan(self, p: Params, args: Arrays, state: Arrays) -> tuple[list[Any], list[Any]]:
         n, k, body = p["num_consts"], p["num_carry"], p["jaxpr"]
 
-        def turn(carry: Any, xs: Any) -> Any:
+        def turn(carry: tuple[Arrays, Arrays], xs: Sequence[Array]) -> Any:
             found, now = self.run(body.jaxpr, body.consts, [*args[:n], *carry[0], *xs], carry[1])
             return (found[:k], now), found[k:]
 
@@ -102,5 +107,5 @@ class Rewriting:
         return [*carry, *ys], state
 
 
-def _parted(found: Sequence[Any], n: int) -> tuple[list[Any], list[Any]]:
+def _parted(found: Sequence[Array], n: int) -> tuple[list[Any], list[Any]]:
     return list(found[:n]), list(found[n:])

@@ -7,13 +7,16 @@ polynomial) and what arithmetic on it means is up to its subclasses.
 import functools
 import operator
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Generic, TypeVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Literal
+from jax.typing import ArrayLike
+from jaxtyping import Array
 
+from ..types import Atom, Equation, aval_of
 from .movement import MOVEMENTS, dynamic_slice, gather, scatter
 from .numbers import converted, on_numbers
 from .objects import are_known, columns, is_number, objects
@@ -37,7 +40,11 @@ class Unsupported(Exception):
         self.reason, self.equation, self.primitive = reason, equation, primitive
 
 
-class ScalarInterpreter:
+# What an entry is.
+E = TypeVar("E")
+
+
+class ScalarInterpreter(Generic[E]):
     """Runs jaxprs; gives up with `Unsupported` after more than `limit` operations.
 
     An entry that is known while tracing is a numpy scalar.
@@ -49,28 +56,28 @@ class ScalarInterpreter:
 
     # What subclasses say of entries
 
-    def traced(self, x: Any) -> np.ndarray:
+    def traced(self, x: Array) -> np.ndarray:
         """The entries of a constant that is being traced."""
         raise NotImplementedError
 
-    def opaque(self, eqn: Any, args: list[np.ndarray]) -> list[np.ndarray]:
+    def opaque(self, eqn: Equation, args: list[np.ndarray]) -> list[np.ndarray]:
         """A function with a derivative of its own."""
         raise NotImplementedError
 
-    def apply(self, eqn: Any, x: list[Any]) -> Any:
+    def apply(self, eqn: Equation, x: list[E]) -> Any:
         """An elementwise primitive, no sum or product."""
         raise NotImplementedError
 
-    def product(self, a: Any, b: Any) -> Any:
+    def product(self, a: E, b: E) -> Any:
         raise NotImplementedError
 
-    def total(self, a: Any, b: Any) -> Any:
+    def total(self, a: E, b: E) -> Any:
         raise NotImplementedError
 
-    def negative(self, a: Any) -> Any:
+    def negative(self, a: E) -> Any:
         raise NotImplementedError
 
-    def larger(self, a: Any, b: Any) -> Any:
+    def larger(self, a: E, b: E) -> Any:
         raise NotImplementedError
 
     # Arithmetic
@@ -80,8 +87,8 @@ class ScalarInterpreter:
         env: dict[Any, np.ndarray] = dict(zip(jaxpr.invars, args, strict=True))
         env.update(zip(jaxpr.constvars, map(self.constant, closed.consts), strict=True))
 
-        def read(v: Any) -> np.ndarray:
-            return self.constant(np.asarray(v.val, v.aval.dtype)) if isinstance(v, Literal) else env[v]
+        def read(v: Atom) -> np.ndarray:
+            return self.constant(np.asarray(v.val, aval_of(v).dtype)) if isinstance(v, Literal) else env[v]
 
         for eqn in jaxpr.eqns:
             values = self.equation(eqn, [read(v) for v in eqn.invars])
@@ -90,14 +97,14 @@ class ScalarInterpreter:
                 raise Unsupported("too many operations")
         return [read(v) for v in jaxpr.outvars]
 
-    def constant(self, x: Any) -> np.ndarray:
+    def constant(self, x: ArrayLike) -> np.ndarray:
         """A constant as known numbers, or as unknown ones where it is being traced."""
-        if isinstance(x, jax.core.Tracer):
+        if isinstance(x, Tracer):
             return self.traced(x)
         x = np.asarray(x)
         return objects([x[i] for i in np.ndindex(x.shape)], x.shape)
 
-    def equation(self, eqn: Any, args: list[np.ndarray]) -> list[np.ndarray]:
+    def equation(self, eqn: Equation, args: list[np.ndarray]) -> list[np.ndarray]:
         name = eqn.primitive.name
         sizes = [v.aval.size for v in eqn.outvars]
         if name == "dot_general":
@@ -121,7 +128,7 @@ class ScalarInterpreter:
             raise Unsupported(f"`{name}` of entries is not known")
         return out if isinstance(out, list) else [out]
 
-    def elementwise(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
+    def elementwise(self, eqn: Equation, args: list[np.ndarray]) -> np.ndarray:
         shape = eqn.outvars[0].aval.shape
         operands = [np.broadcast_to(a, shape).ravel() for a in args]
         size = operands[0].size if operands else 0
@@ -133,7 +140,7 @@ class ScalarInterpreter:
                 return objects(list(numbers), shape)
         return objects([self.scalar(eqn, [o[i] for o in operands]) for i in range(size)], shape)
 
-    def scalar(self, eqn: Any, x: list[Any]) -> Any:
+    def scalar(self, eqn: Equation, x: list[E]) -> Any:
         name = eqn.primitive.name
         match name:
             case "mul":
@@ -156,30 +163,30 @@ class ScalarInterpreter:
                 return x[0]
         return self.apply(eqn, x)
 
-    def reduce_sum(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
+    def reduce_sum(self, eqn: Equation, args: list[np.ndarray]) -> np.ndarray:
         return self.reduced(eqn, args[0], self.total, 0)
 
-    def reduce_max(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
+    def reduce_max(self, eqn: Equation, args: list[np.ndarray]) -> np.ndarray:
         return self.reduced(eqn, args[0], self.larger, -np.inf)
 
-    def reduced(self, eqn: Any, x: np.ndarray, combine: Callable[[Any, Any], Any], identity: float) -> np.ndarray:
+    def reduced(self, eqn: Equation, x: np.ndarray, combine: Callable[[E, E], E], identity: float) -> np.ndarray:
         dtype = eqn.outvars[0].aval.dtype
         if identity and not jnp.issubdtype(dtype, jnp.floating):
             raise Unsupported("the maximum of numbers other than floats is not known")
         x = columns(x, eqn.params["axes"])
-        first = np.asarray(identity, dtype)[()]
+        first: Any = np.asarray(identity, dtype)[()]
         return objects(
             [functools.reduce(combine, x[(slice(None), *i)], first) for i in np.ndindex(x.shape[1:])], x.shape[1:]
         )
 
-    def dot_general(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
+    def dot_general(self, eqn: Equation, args: list[np.ndarray]) -> np.ndarray:
         (lhs_contract, rhs_contract), (lhs_batch, rhs_batch) = eqn.params["dimension_numbers"]
         lhs, rhs = (
             _matrices(a, batch, contract)
             for a, batch, contract in zip(args, (lhs_batch, rhs_batch), (lhs_contract, rhs_contract), strict=True)
         )
         aval = eqn.outvars[0].aval
-        zero = np.zeros((), aval.dtype)[()]
+        zero: Any = np.zeros((), aval.dtype)[()]
         out = [
             functools.reduce(self.total, (self.product(x, y) for x, y in zip(a, b, strict=True)), zero)
             for left, right in zip(lhs, rhs, strict=True)
@@ -188,10 +195,10 @@ class ScalarInterpreter:
         ]
         return objects(out, aval.shape)
 
-    def add_any(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
+    def add_any(self, eqn: Equation, args: list[np.ndarray]) -> np.ndarray:
         return objects(list(map(self.total, *(a.ravel() for a in args))), eqn.outvars[0].aval.shape)
 
-    def _at_places(self, eqn: Any, args: list[np.ndarray]) -> np.ndarray:
+    def _at_places(self, eqn: Equation, args: list[np.ndarray]) -> np.ndarray:
         """What reads or writes at places, which must be known."""
         name = eqn.primitive.name
         if not all(map(are_known, args[1:2] if name != "dynamic_slice" else args[1:])):
@@ -200,7 +207,8 @@ class ScalarInterpreter:
             return dynamic_slice(eqn, *args)
         if name == "gather":
             return gather(eqn, *args)
-        return scatter(eqn, *args, combine=self.total if name == "scatter-add" else lambda _, update: update)
+        combine: Callable[..., Any] = self.total if name == "scatter-add" else lambda _, update: update
+        return scatter(eqn, *args, combine=combine)
 
 
 def _matrices(x: np.ndarray, batch: tuple[int, ...], contract: tuple[int, ...]) -> np.ndarray:

@@ -18,13 +18,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import jaxpr_as_fun
+from jax.typing import ArrayLike
+from jaxtyping import Array, PyTree
 
+from ..types import Aval, Equation
 from .objects import is_number, objects
 from .scalar_interpreter import ScalarInterpreter, Unsupported
 
 
 # Above this many scalar operations straight-line code costs more to compile than it saves at run time.
 LIMIT = 500
+
+# Traced, or known.
+Scalar = Array | np.number
 
 
 def scalarise(fn: Callable[..., Any], limit: int = LIMIT) -> Callable[..., Any]:
@@ -36,18 +42,18 @@ def scalarise(fn: Callable[..., Any], limit: int = LIMIT) -> Callable[..., Any]:
     """
 
     @functools.wraps(fn)
-    def scalarised(*args: Any) -> Any:
+    def scalarised(*args: PyTree) -> Any:
         leaves, treedef = jax.tree.flatten(args)
         if sum(map(np.size, leaves)) > limit:
             return fn(*args)
 
-        def flat(*flat_leaves: Any) -> Any:
+        def flat(*flat_leaves: Array) -> Any:
             return fn(*jax.tree.unflatten(treedef, flat_leaves))
 
         jaxpr, out = jax.make_jaxpr(flat, return_shape=True)(*leaves)
         shapes, out_tree = jax.tree.flatten(out)
 
-        def as_scalars(*flat_leaves: Any) -> list[jax.Array]:
+        def as_scalars(*flat_leaves: Array) -> list[jax.Array]:
             outputs = _Scalars(limit).run(jaxpr, [_scalars(leaf) for leaf in flat_leaves])
             return [_array(o, s) for o, s in zip(outputs, shapes, strict=True)]
 
@@ -61,7 +67,7 @@ def scalarise(fn: Callable[..., Any], limit: int = LIMIT) -> Callable[..., Any]:
     return scalarised
 
 
-def _scalars(x: Any) -> np.ndarray:
+def _scalars(x: ArrayLike) -> np.ndarray:
     """An array as a numpy array of scalars."""
     shape = np.shape(x)
     if isinstance(x, np.ndarray | np.generic | float | int | bool):
@@ -73,7 +79,7 @@ def _scalars(x: Any) -> np.ndarray:
     return objects(entries, shape)
 
 
-def _array(scalars: np.ndarray, struct: Any) -> jax.Array:
+def _array(scalars: np.ndarray, struct: Aval) -> jax.Array:
     entries = [jnp.asarray(s, struct.dtype) for s in scalars.ravel()]
     if not struct.shape:
         return entries[0]
@@ -82,17 +88,17 @@ def _array(scalars: np.ndarray, struct: Any) -> jax.Array:
     return jnp.stack(entries).reshape(struct.shape)
 
 
-class _Scalars(ScalarInterpreter):
+class _Scalars(ScalarInterpreter[Scalar]):
     """Each entry that is not known is a traced scalar."""
 
-    def traced(self, x: Any) -> np.ndarray:
+    def traced(self, x: Array) -> np.ndarray:
         return _scalars(x)
 
-    def opaque(self, eqn: Any, args: list[np.ndarray]) -> list[np.ndarray]:
+    def opaque(self, eqn: Equation, args: list[np.ndarray]) -> list[np.ndarray]:
         arrays = [_array(a, v.aval) for a, v in zip(args, eqn.invars, strict=True)]
         return list(map(_scalars, eqn.primitive.bind(*arrays, **eqn.primitive.get_bind_params(eqn.params))))
 
-    def apply(self, eqn: Any, x: list[Any]) -> Any:
+    def apply(self, eqn: Equation, x: list[Scalar]) -> Any:
         self.operations += 1
         avals = [v.aval for v in eqn.invars]
         params = eqn.params
@@ -100,7 +106,7 @@ class _Scalars(ScalarInterpreter):
             params = dict(params, sharding=None)
         return eqn.primitive.bind(*(jnp.asarray(v, a.dtype) for v, a in zip(x, avals, strict=True)), **params)
 
-    def product(self, a: Any, b: Any) -> Any:
+    def product(self, a: Scalar, b: Scalar) -> Any:
         if is_number(a, 0) or is_number(b, 1):
             return a
         if is_number(b, 0) or is_number(a, 1):
@@ -110,7 +116,7 @@ class _Scalars(ScalarInterpreter):
         self.operations += 1
         return a * b
 
-    def total(self, a: Any, b: Any) -> Any:
+    def total(self, a: Scalar, b: Scalar) -> Any:
         if is_number(a, 0):
             return b
         if is_number(b, 0):
@@ -118,13 +124,13 @@ class _Scalars(ScalarInterpreter):
         self.operations += 1
         return a + b
 
-    def negative(self, a: Any) -> Any:
+    def negative(self, a: Scalar) -> Any:
         if is_number(a, 0):
             return a
         self.operations += 1
         return -a
 
-    def larger(self, a: Any, b: Any) -> Any:
+    def larger(self, a: Scalar, b: Scalar) -> Any:
         if is_number(a) and is_number(b):
             return np.maximum(a, b)
         if is_number(a, -np.inf):

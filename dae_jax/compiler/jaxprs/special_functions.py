@@ -2,15 +2,18 @@
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr
+from jaxtyping import Array
+
+from ..types import DType, Equation
 
 
-def _polynomial(coefficients: Sequence[float], x: Any) -> Any:
+def _polynomial(coefficients: Sequence[float], x: Array) -> Any:
     return functools.reduce(lambda p, c: p * x + jnp.asarray(c, x.dtype), coefficients, jnp.zeros_like(x))
 
 
@@ -41,7 +44,7 @@ _ERF_INV_64 = (
 )  # fmt: skip
 
 
-def erf_inv(x: Any, **_: Any) -> Any:
+def erf_inv(x: Array, **_: object) -> Any:
     """y with erf(y) = x."""
     w = -jnp.log1p(-x * x)
     root = jnp.sqrt(w)
@@ -62,7 +65,7 @@ _LANCZOS = (
 )  # fmt: skip
 
 
-def digamma(x: Any, **_: Any) -> Any:
+def digamma(x: Array, **_: object) -> Any:
     """The derivative of log Γ(x), by Lanczos' approximation; below 1/2 by reflection."""
     reflected = x < 0.5
     z = jnp.where(reflected, -x, x - 1)
@@ -81,7 +84,7 @@ def digamma(x: Any, **_: Any) -> Any:
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 
 
-def threefry2x32(key1: Any, key2: Any, x1: Any, x2: Any) -> tuple[Any, Any]:
+def threefry2x32(key1: Array, key2: Array, x1: Array, x2: Array) -> tuple[Any, Any]:
     """Threefry with 20 rounds: random bits from a key and a counter."""
     keys = [key1, key2, key1 ^ key2 ^ jnp.uint32(0x1BD11BDA)]
     x1, x2 = x1 + keys[0], x2 + keys[1]
@@ -107,7 +110,7 @@ SPECIAL: dict[str, Callable[..., Any]] = {
 }
 
 
-def by_simpler_ones(eqn: Any) -> ClosedJaxpr:
+def by_simpler_ones(eqn: Equation) -> ClosedJaxpr:
     """A jaxpr that computes what an equation does whose primitive is in the table."""
     structs = tuple((v.aval.shape, v.aval.dtype) for v in eqn.invars)
     found = _traced(eqn.primitive.name, structs, tuple(eqn.params.items()))
@@ -116,7 +119,9 @@ def by_simpler_ones(eqn: Any) -> ClosedJaxpr:
 
 
 @functools.lru_cache(maxsize=64)
-def _traced(name: str, structs: tuple[Any, ...], params: tuple[Any, ...]) -> ClosedJaxpr:
+def _traced(
+    name: str, structs: tuple[tuple[tuple[int, ...], DType], ...], params: tuple[tuple[str, Hashable], ...]
+) -> ClosedJaxpr:
     return jax.make_jaxpr(functools.partial(SPECIAL[name], **dict(params)))(
         *(jax.ShapeDtypeStruct(*s) for s in structs)
     )

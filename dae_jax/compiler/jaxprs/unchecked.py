@@ -1,19 +1,21 @@
 """Functions without the checks that their caller has made already."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
-from jax.extend.core import ClosedJaxpr, Jaxpr
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jaxtyping import Array, PyTree
 
 from .._compat import is_check
+from ..types import Arrays, Atom, Equation
 from .walk import equations, equations_in
 
 
 def without_checks(fn: Callable[..., Any]) -> Callable[..., Any]:
     """`fn` without `equinox.error_if`: for conditions that the caller has looked at already."""
 
-    def unchecked(*args: Any) -> Any:
+    def unchecked(*args: PyTree) -> Any:
         jaxpr, out = jax.make_jaxpr(fn, return_shape=True)(*args)
         results = _evaluate(jaxpr.jaxpr, jaxpr.consts, jax.tree.leaves(args))
         return jax.tree.unflatten(jax.tree.structure(out), results)
@@ -28,18 +30,18 @@ def checks_dropped(closed: ClosedJaxpr) -> ClosedJaxpr:
     return jax.make_jaxpr(lambda *xs: _evaluate(closed.jaxpr, closed.consts, xs))(*closed.in_avals)
 
 
-def _evaluate(jaxpr: Jaxpr, consts: Any, args: Any) -> list[Any]:
+def _evaluate(jaxpr: Jaxpr, consts: Sequence[Array], args: Sequence[Array]) -> list[Any]:
     env = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *args], strict=True))
 
-    def read(v: Any) -> Any:
-        return v.val if isinstance(v, jax.extend.core.Literal) else env[v]
+    def read(v: Atom) -> Any:
+        return v.val if isinstance(v, Literal) else env[v]
 
     for eqn in jaxpr.eqns:
         env.update(zip(eqn.outvars, _results(eqn, [read(v) for v in eqn.invars]), strict=True))
     return [read(v) for v in jaxpr.outvars]
 
 
-def _results(eqn: Any, values: list[Any]) -> list[Any]:
+def _results(eqn: Equation, values: Arrays) -> list[Any]:
     """What an equation gives, without the checks in it."""
     name = eqn.primitive.name
     if name in ("jit", "pjit", "custom_jvp_call", "cond") and any(map(is_check, equations_in(eqn))):
@@ -54,7 +56,7 @@ def _results(eqn: Any, values: list[Any]) -> list[Any]:
     return results if eqn.primitive.multiple_results else [results]
 
 
-def _unchecked(eqn: Any) -> ClosedJaxpr | None:
+def _unchecked(eqn: Equation) -> ClosedJaxpr | None:
     """What to run in place of a check, or of a call with checks in it; `None` for other equations."""
     name = eqn.primitive.name
     if name == "cond":
@@ -68,5 +70,5 @@ def _unchecked(eqn: Any) -> ClosedJaxpr | None:
     return None
 
 
-def _is_checking(eqn: Any) -> bool:
+def _is_checking(eqn: Equation) -> bool:
     return eqn.primitive.name == "cond" and _unchecked(eqn) is not None

@@ -6,17 +6,17 @@ import numpy as np
 
 from .arrays import Buffer
 from .dtypes import BYTES
-from .instructions import Complex, Instructions, Value, parts
+from .instructions import Complex, Index, Instructions, Number, Value, parts
 
 
-def load(code: Instructions, buffer: Buffer, place: Any) -> Any:
+def load(code: Instructions, buffer: Buffer, place: Index) -> Any:
     """A number."""
     if buffer.parts == 1:
         return _loaded(code, buffer, place)
     return Complex(*(_loaded(code, buffer, _part(code, buffer, place, k)) for k in range(2)))
 
 
-def store(code: Instructions, buffer: Buffer, place: Any, x: Any) -> None:
+def store(code: Instructions, buffer: Buffer, place: Index, x: Number) -> None:
     """Stores a number, in the lanes that take part."""
     if buffer.parts == 1:
         _store(code, buffer, place, x)
@@ -25,7 +25,7 @@ def store(code: Instructions, buffer: Buffer, place: Any, x: Any) -> None:
         _store(code, buffer, _part(code, buffer, place, k), part)
 
 
-def _part(code: Instructions, buffer: Buffer, place: Any, k: int) -> Any:
+def _part(code: Instructions, buffer: Buffer, place: Index, k: int) -> Any:
     """Where the k-th part of a complex number is."""
     return code.plus(place, k * buffer.plane) if buffer.plane else code.plus(code.times(place, 2), k)
 
@@ -34,12 +34,12 @@ def _stored(buffer: Buffer) -> str:
     return "i8" if buffer.kind == "i1" else buffer.kind
 
 
-def _address(code: Instructions, buffer: Buffer, place: Any) -> tuple[str, bool]:
+def _address(code: Instructions, buffer: Buffer, place: Index) -> tuple[str, bool]:
     """The address of a number, or a vector of addresses (and whether it is one)."""
     each = isinstance(place, Value) and place.lanes
     if buffer.lanes:
         place = code.times(place, code.width)
-        if each:
+        if each and isinstance(place, Value):
             lane = ", ".join(f"i64 {k}" for k in range(code.width))
             place = code.pure(f"add {code.type('i64', True)} {place.name}, <{lane}>", "i64", True)
     index = code.operand(place, "i64", each)
@@ -52,7 +52,7 @@ def _active(code: Instructions) -> str:
     return f"{code.type('i1', True)} {code.text(code.mask, 'i1', True) if code.mask else 'splat (i1 true)'}"
 
 
-def _loaded(code: Instructions, buffer: Buffer, place: Any) -> Value:
+def _loaded(code: Instructions, buffer: Buffer, place: Index) -> Value:
     stored = _stored(buffer)
     address, each = _address(code, buffer, place)
     vector = code.type(stored, each or buffer.lanes)
@@ -68,10 +68,10 @@ def _loaded(code: Instructions, buffer: Buffer, place: Any) -> Value:
     return code.cast("trunc", x, "i1") if buffer.kind == "i1" else x
 
 
-def _store(code: Instructions, buffer: Buffer, place: Any, x: Any) -> None:
+def _store(code: Instructions, buffer: Buffer, place: Index, x: Number) -> None:
     stored = _stored(buffer)
     if buffer.kind == "i1":
-        x = code.cast("zext", x, "i8") if isinstance(x, Value) else np.int8(x)
+        x = code.cast("zext", x, "i8") if isinstance(x, Value) else np.int8(bool(x))
     address, each = _address(code, buffer, place)
     number = code.operand(x, stored, buffer.lanes or each)
     if not each and code.mask is None:

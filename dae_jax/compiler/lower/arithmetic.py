@@ -10,7 +10,7 @@ from ..jaxprs.numbers import converted
 from ..jaxprs.objects import is_number
 from . import complex_arithmetic
 from .dtypes import BYTES, is_signed, kind_of, part
-from .instructions import Complex, Instructions, Value, parts
+from .instructions import Complex, Instructions, Number, Value, parts
 
 
 _OF_FLOATS = {"add": "fadd contract", "sub": "fsub contract", "mul": "fmul contract", "div": "fdiv", "rem": "frem"}
@@ -22,7 +22,7 @@ _KNOWN = {
 }  # fmt: skip
 
 
-def applied(code: Instructions, name: str, dtype: np.dtype, a: Any, b: Any) -> Any:
+def applied(code: Instructions, name: str, dtype: np.dtype, a: Number, b: Number) -> Any:
     """`add`, `sub`, `mul`, `div`, `rem`, `max`, `min`, `and`, `or` and `xor` of two numbers of a type."""
     if dtype.kind == "c":
         return complex_arithmetic.OPERATIONS[name](code, kind_of(part(dtype)), a, b)
@@ -41,7 +41,7 @@ def applied(code: Instructions, name: str, dtype: np.dtype, a: Any, b: Any) -> A
     return code.op(name, kind, a, b)
 
 
-def combined(code: Instructions, name: str, dtype: np.dtype, a: Any, b: Any) -> Any:
+def combined(code: Instructions, name: str, dtype: np.dtype, a: Number, b: Number) -> Any:
     """The same of numbers that may be known both, by `logaddexp` too; `div` and `rem` are not."""
     if is_number(a) and is_number(b):
         with np.errstate(all="ignore"):
@@ -49,22 +49,22 @@ def combined(code: Instructions, name: str, dtype: np.dtype, a: Any, b: Any) -> 
     return applied(code, name, dtype, a, b)
 
 
-def total(code: Instructions, dtype: np.dtype, a: Any, b: Any) -> Any:
+def total(code: Instructions, dtype: np.dtype, a: Number, b: Number) -> Any:
     """The sum; nothing is written for a known 0."""
     return b if is_number(a, 0) else a if is_number(b, 0) else combined(code, "add", dtype, a, b)
 
 
-def _of_floats(code: Instructions, name: str, kind: str, a: Any, b: Any) -> Value:
+def _of_floats(code: Instructions, name: str, kind: str, a: Number, b: Number) -> Value:
     if name == "add" and a is b and isinstance(a, Value):
         return code.scaled(a, 2.0, kind)
     if name in ("mul", "div"):
         value, number = (b, a) if name == "mul" and isinstance(b, Value) else (a, b)
-        if isinstance(value, Value) and not isinstance(number, Value) and _is_power_of_two(number):
+        if isinstance(value, Value) and not isinstance(number, Value | Complex) and _is_power_of_two(float(number)):
             return code.scaled(value, float(number) if name == "mul" else 1 / float(number), kind)
     return code.op(_OF_FLOATS[name], kind, a, b)
 
 
-def _log_of_sum(code: Instructions, kind: str, a: Any, b: Any) -> Value:
+def _log_of_sum(code: Instructions, kind: str, a: Number, b: Number) -> Value:
     """log(eᵃ + eᵇ)."""
     largest = code.intrinsic("maximum", kind, a, b)
     apart = code.intrinsic("fabs", kind, code.op("fsub", kind, a, b))
@@ -74,7 +74,7 @@ def _log_of_sum(code: Instructions, kind: str, a: Any, b: Any) -> Value:
     return code.select(undefined, code.op("fadd", kind, a, b), code.op("fadd", kind, largest, more), kind)
 
 
-def _quotient(code: Instructions, name: str, dtype: np.dtype, a: Any, b: Any) -> Value:
+def _quotient(code: Instructions, name: str, dtype: np.dtype, a: Number, b: Number) -> Value:
     # The processor traps at x/0 and at −2^(n−1)/−1; XLA gives −1 (x for the remainder) and the number itself (0).
     kind, signed = kind_of(dtype), is_signed(dtype)
     instruction = f"{'s' if signed else 'u'}{name}"
@@ -90,7 +90,7 @@ def _quotient(code: Instructions, name: str, dtype: np.dtype, a: Any, b: Any) ->
     return code.select(by_none, -1 if name == "div" else a, out, kind)
 
 
-def compared(code: Instructions, name: str, dtype: np.dtype, a: Any, b: Any) -> Value:
+def compared(code: Instructions, name: str, dtype: np.dtype, a: Number, b: Number) -> Value:
     """`eq`, `ne`, `lt`, `le`, `gt` and `ge` of two real numbers of a type."""
     if dtype.kind == "f":
         return code.op(f"fcmp {_COMPARISONS[name]}", kind_of(dtype), a, b, result="i1")
@@ -98,7 +98,7 @@ def compared(code: Instructions, name: str, dtype: np.dtype, a: Any, b: Any) -> 
     return code.op(f"icmp {signed}{name}", kind_of(dtype), a, b, result="i1")
 
 
-def convert(code: Instructions, x: Any, dtype: np.dtype, to: np.dtype) -> Any:
+def convert(code: Instructions, x: Number, dtype: np.dtype, to: np.dtype) -> Any:
     """A number of one type as one of another."""
     if dtype == to:
         return x
@@ -108,6 +108,7 @@ def convert(code: Instructions, x: Any, dtype: np.dtype, to: np.dtype) -> Any:
     if dtype.kind == "c":
         return convert(code, parts(x)[0], part(dtype), to)
     if not isinstance(x, Value):
+        assert not isinstance(x, Complex)
         return converted(x, to)
     a, b = kind_of(dtype), kind_of(to)
     if a == b:
@@ -132,7 +133,7 @@ def _rounded(code: Instructions, x: Value, to: np.dtype) -> Value:
     return code.pure(f"call {result} {full}({operand} {x.name})", kind, x.lanes)
 
 
-def power(code: Instructions, x: Any, exponent: int, dtype: np.dtype) -> Any:
+def power(code: Instructions, x: Number, exponent: int, dtype: np.dtype) -> Any:
     """A whole power, by squares."""
     n, out = abs(exponent), None
     while n:
@@ -147,7 +148,7 @@ def power(code: Instructions, x: Any, exponent: int, dtype: np.dtype) -> Any:
 
 
 def better(
-    code: Instructions, name: str, dtype: np.dtype, to: np.dtype, found: Sequence[Any], other: Sequence[Any]
+    code: Instructions, name: str, dtype: np.dtype, to: np.dtype, found: Sequence[Number], other: Sequence[Number]
 ) -> tuple[Any, Any]:
     """Of two numbers with their places the one that `argmax` or `argmin` looks for; the first that is undefined."""
     kind, (best, place), (y, there) = kind_of(dtype), found, other
@@ -173,5 +174,5 @@ def identity(name: str, dtype: np.dtype) -> Any:
     return dtype.type(info.min if name == "max" else info.max)
 
 
-def _is_power_of_two(x: Any) -> bool:
-    return bool(x > 0) and math.frexp(x)[0] == 0.5 and 1e-30 < x < 1e30
+def _is_power_of_two(x: float) -> bool:
+    return x > 0 and math.frexp(x)[0] == 0.5 and 1e-30 < x < 1e30

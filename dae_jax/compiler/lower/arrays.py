@@ -19,7 +19,7 @@ With `always_copies` no buffer is ever used twice: what that gives, this must gi
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -97,11 +97,15 @@ class Fused(_Array):
         return dataclasses.replace(self, shape=tuple(shape), read=read, flat=flat, depth=self.depth + 1)
 
 
+# An array: as entries, each a `Number`; in memory; or yet to be computed.
+Operand: TypeAlias = np.ndarray | View | Fused
+
+
 def row_major(shape: Sequence[int]) -> tuple[int, ...]:
     """The strides of an array whose last index runs fastest."""
     return tuple(math.prod(shape[i + 1 :]) for i in range(len(shape)))
 
 
-def shared(x: Any, y: Any) -> bool:
+def shared(x: Operand, y: Operand) -> bool:
     """Whether two arrays read the same memory."""
     return bool(set(getattr(x, "buffers", ())).intersection(getattr(y, "buffers", ())))

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from ..thresholds import THRESHOLDS
-from .instructions import Instructions, Value
+from .instructions import Index, Instructions, Number, Value
 
 
 @contextlib.contextmanager
-def loop(code: Instructions, count: Any, phis: list[str] | None = None) -> Iterator[Value]:
+def loop(code: Instructions, count: Index, phis: list[str] | None = None) -> Iterator[Value]:
     """Runs what is written inside for an index from 0 to `count`; `phis` are other variables of the loop."""
     head, body, after, index, following = (code.name() for _ in range(5))
     before = code.block
@@ -32,7 +32,7 @@ def loop(code: Instructions, count: Any, phis: list[str] | None = None) -> Itera
 
 
 def for_each(
-    code: Instructions, shape: Sequence[int], action: Callable[[list[Any]], None], few: int = THRESHOLDS.per_turn
+    code: Instructions, shape: Sequence[int], action: Callable[[list[Index]], None], few: int = THRESHOLDS.per_turn
 ) -> None:
     """Does something with each index, in loops whose body has the last `few` written out."""
     if 0 in shape:
@@ -49,24 +49,25 @@ def for_each(
 def accumulated(
     code: Instructions,
     shape: Sequence[int],
-    first: Sequence[Any],
+    first: Sequence[Number],
     kinds: Sequence[str],
-    step: Callable[[list[Any], list[Any]], Sequence[Any]],
+    step: Callable[[list[Number], list[Index]], Sequence[Number]],
 ) -> list[Any]:
     """What `step(found, index)` makes of the first numbers, index after index."""
     lanes = code.width > 1
 
-    def over(index: list[Any], found: list[Any]) -> list[Any]:
+    def over(index: list[Index], found: list[Number]) -> list[Any]:
         if len(index) == len(shape):
             return list(step(found, index))
         before, phis = code.block, []
         carried = [Value(f"%{code.name()}", kind, lanes) for kind in kinds]
         with loop(code, shape[len(index)], phis) as i:
-            for x, y, z in zip(carried, found, over([*index, i], carried), strict=True):
+            for x, y, z in zip(carried, found, over([*index, i], [*carried]), strict=True):
                 start, after = (code.text(n, x.kind, lanes) for n in (y, z))
                 vector = code.type(x.kind, lanes)
                 phis.append(f"{x.name} = phi {vector} [ {start}, %{before} ], [ {after}, %{code.block} ]")
         return list(carried)
 
-    found = [code.copy(x, kind) if lanes else x for x, kind in zip(first, kinds, strict=True)]
-    return over([], [code.in_lanes(x) for x in found] if lanes else found)
+    if not lanes:
+        return over([], list(first))
+    return over([], [code.in_lanes(code.copy(x, kind)) for x, kind in zip(first, kinds, strict=True)])

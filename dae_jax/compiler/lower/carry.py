@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from ..thresholds import THRESHOLDS
-from .arrays import View
+from ..types import Aval
+from .arrays import Operand, View
 from .dtypes import kinds_of
 from .instructions import Instructions, Value
 from .memory import Memory
@@ -14,7 +15,7 @@ from .operands import of_texts, retain, texts
 class Carry:
     """Entries as phi nodes, large arrays in a buffer of the loop's own; `lanes`: which differ from lane to lane."""
 
-    def __init__(self, memory: Memory, avals: list[Any], first: list[Any], lanes: Sequence[bool]) -> None:
+    def __init__(self, memory: Memory, avals: list[Aval], first: list[Operand], lanes: Sequence[bool]) -> None:
         self.memory, self.avals = memory, avals
         self.lanes = list(lanes) or [False] * len(avals)
         self.values: list[Any] = []
@@ -25,7 +26,7 @@ class Carry:
         for x in self.values:
             retain(x, -1)
 
-    def _enter(self, aval: Any, x: Any, each: bool) -> None:
+    def _enter(self, aval: Aval, x: Operand, each: bool) -> None:
         code = self.memory.code
         if aval.size > THRESHOLDS.carried:
             x = self.memory.own(x, aval.dtype)
@@ -39,7 +40,7 @@ class Carry:
             x = of_texts(self.names[-1], aval, each)
         self.values.append(x)
 
-    def turn(self, new: list[Any], entered: str, mask: Value | None) -> list[str]:
+    def turn(self, new: list[Operand], entered: str, mask: Value | None) -> list[str]:
         """The end of a turn; gives the phi nodes at its beginning."""
         code, phis, following = self.memory.code, [], []
         new = kept_apart(self.memory, new, self.values, self.avals)
@@ -68,12 +69,12 @@ def _chosen(code: Instructions, mask: Value, new: list[str], old: list[str], kin
     ]
 
 
-def kept_apart(memory: Memory, new: list[Any], carry: list[Any], avals: list[Any]) -> list[Any]:
+def kept_apart(memory: Memory, new: list[Operand], carry: list[Operand], avals: list[Aval]) -> list[Any]:
     """What a turn gives, copied where it lies in a buffer of the loop's that gets something else."""
     new = list(map(memory.materialised, new))
     held = {x.buffer for x in carry if isinstance(x, View)}
 
-    def overwritten(x: Any, own: Any) -> bool:
+    def overwritten(x: Operand, own: View) -> bool:
         return isinstance(x, View) and x.buffer in held and not (x.buffer is own.buffer and x.whole)
 
     return [

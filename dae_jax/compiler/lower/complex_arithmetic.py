@@ -2,39 +2,39 @@
 
 from typing import Any
 
-from .instructions import Complex, Instructions, parts
+from .instructions import Complex, Instructions, Number, parts
 
 
-def negative(code: Instructions, kind: str, x: Any) -> Complex:
+def negative(code: Instructions, kind: str, x: Number) -> Complex:
     """−x."""
     a, b = parts(x)
     return Complex(code.op("fneg", kind, a), code.op("fneg", kind, b))
 
 
-def conjugate(code: Instructions, kind: str, x: Any) -> Complex:
+def conjugate(code: Instructions, kind: str, x: Number) -> Complex:
     """The complex conjugate."""
     a, b = parts(x)
     return Complex(a, code.op("fneg", kind, b))
 
 
-def size(code: Instructions, kind: str, x: Any) -> Any:
+def size(code: Instructions, kind: str, x: Number) -> Any:
     """|x|."""
     return code.library("hypot", kind, *parts(x))
 
 
-def added(code: Instructions, kind: str, x: Any, y: Any) -> Complex:
+def added(code: Instructions, kind: str, x: Number, y: Number) -> Complex:
     """x + y."""
     (a, b), (c, d) = parts(x), parts(y)
     return Complex(code.op("fadd contract", kind, a, c), code.op("fadd contract", kind, b, d))
 
 
-def subtracted(code: Instructions, kind: str, x: Any, y: Any) -> Complex:
+def subtracted(code: Instructions, kind: str, x: Number, y: Number) -> Complex:
     """x − y."""
     (a, b), (c, d) = parts(x), parts(y)
     return Complex(code.op("fsub contract", kind, a, c), code.op("fsub contract", kind, b, d))
 
 
-def multiplied(code: Instructions, kind: str, x: Any, y: Any) -> Complex:
+def multiplied(code: Instructions, kind: str, x: Number, y: Number) -> Complex:
     """x y."""
     (a, b), (c, d) = parts(x), parts(y)
     times = lambda u, v: code.op("fmul contract", kind, u, v)
@@ -44,7 +44,7 @@ def multiplied(code: Instructions, kind: str, x: Any, y: Any) -> Complex:
     )
 
 
-def divided(code: Instructions, kind: str, x: Any, y: Any) -> Complex:
+def divided(code: Instructions, kind: str, x: Number, y: Number) -> Complex:
     """By Smith's algorithm: no overflow in c² + d². What is not 0 is infinite by 0."""
     (a, b), (c, d) = parts(x), parts(y)
     absolute = lambda u: code.intrinsic("fabs", kind, u)

@@ -5,8 +5,10 @@ from typing import Any, Protocol
 
 import numpy as np
 from jax.extend.core import ClosedJaxpr
+from jax.typing import ArrayLike
 
-from .arrays import Fused, View
+from ..types import Equation
+from .arrays import Fused, Operand, View
 from .instructions import Instructions
 from .memory import Memory
 
@@ -19,7 +21,9 @@ class Lowering(Protocol):
     code: Instructions
     memory: Memory
 
-    def run(self, closed: ClosedJaxpr, args: list[Any]) -> list[Any]: ...
+    def run(self, closed: ClosedJaxpr, args: list[Operand]) -> list[Operand]: ...
+    def equation(self, eqn: Equation, args: list[Operand]) -> list[Operand]: ...
+    def constant(self, x: ArrayLike) -> Operand: ...
 
 
 class Context:
@@ -31,10 +35,10 @@ class Context:
     - `dtype`, `dtypes`: the type of the last operand, and of each.
     """
 
-    def __init__(self, lowering: Lowering, eqn: Any, large: bool) -> None:
+    def __init__(self, lowering: Lowering, eqn: Equation, large: bool) -> None:
         self.code: Instructions = lowering.code
         self.memory: Memory = lowering.memory
-        self.run: Callable[[ClosedJaxpr, list[Any]], list[Any]] = lowering.run
+        self.run: Callable[[ClosedJaxpr, list[Operand]], list[Operand]] = lowering.run
         self.eqn, self.name, self.large = eqn, eqn.primitive.name, large
         self.outs = [v.aval for v in eqn.outvars]
         self.dtypes = [np.dtype(v.aval.dtype) for v in eqn.invars]
@@ -42,10 +46,14 @@ class Context:
         self.to = np.dtype(self.outs[0].dtype) if self.outs else np.dtype(bool)
         self.dtype = self.dtypes[-1] if self.dtypes else self.to
 
-    def array(self, x: Any, k: int = 0) -> View | Fused:
+    def array(self, x: Operand, k: int = 0) -> View | Fused:
         """Operand k as an array that is not entries."""
         return self.memory.view(x, self.dtypes[k]) if isinstance(x, np.ndarray) else x
 
-    def view(self, x: Any, k: int = 0) -> View:
+    def entries(self, x: Operand) -> np.ndarray:
+        """An operand as entries."""
+        return self.memory.entries(x)
+
+    def view(self, x: Operand, k: int = 0) -> View:
         """Operand k as an array in memory."""
         return self.memory.view(x, self.dtypes[k])

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..jaxprs.numbers import on_numbers
 from ..jaxprs.objects import is_number, objects
-from .arrays import Fused, View
+from .arrays import Fused, Operand, View
 from .context import Context
 from .registry import always, rule
 
@@ -27,9 +27,13 @@ def entrywise(
     """Enters `one(context, *numbers, **params)`, which gives one entry, as the rule of some primitives."""
 
     def enter(one: One) -> One:
-        def lower(context: Context, *args: Any, **params: Any) -> Any:
+        def lower(context: Context, *args: Operand, **params: object) -> Any:
             of_entry = functools.partial(one, context, **params)
-            return _fused(context, of_entry, args) if context.large else _written_out(context, of_entry, args)
+            return (
+                _fused(context, of_entry, args)
+                if context.large
+                else _written_out(context, of_entry, list(map(context.entries, args)))
+            )
 
         rule(names, dtypes, requires=requires, moves=moves, fuses=True)(lower)
         return one
@@ -48,7 +52,7 @@ def _written_out(context: Context, one: One, args: Sequence[np.ndarray]) -> np.n
     return objects([one(*x) for x in zip(*operands, strict=True)], shape)
 
 
-def _fused(context: Context, one: One, args: Sequence[Any]) -> Fused:
+def _fused(context: Context, one: One, args: Sequence[Operand]) -> Fused:
     memory = context.memory
     args = [_operand(context, k, a) for k, a in enumerate(args)]
     readers = [((lambda _, a=a: a[()]) if isinstance(a, np.ndarray) else memory.flat(a)) for a in args]
@@ -63,7 +67,7 @@ def _fused(context: Context, one: One, args: Sequence[Any]) -> Fused:
     )
 
 
-def _operand(context: Context, k: int, x: Any) -> np.ndarray | View | Fused:
+def _operand(context: Context, k: int, x: Operand) -> np.ndarray | View | Fused:
     """An operand of the result's shape, or with axes of length 1 whose one entry is read at any index."""
     shape = tuple(context.out.shape)
     if x.size == 1:

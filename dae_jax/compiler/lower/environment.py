@@ -1,19 +1,23 @@
 """A jaxpr that is being run."""
 
 from collections import Counter
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal, Var
 
 from ..thresholds import THRESHOLDS
+from ..types import Atom, aval_of
+from .arrays import Operand
+from .context import Lowering
 from .operands import retain
 
 
 class Environment:
     """How far it has been run, and the values that are still needed."""
 
-    def __init__(self, lowering: Any, closed: ClosedJaxpr, args: list[Any]) -> None:
+    def __init__(self, lowering: Lowering, closed: ClosedJaxpr, args: list[Operand]) -> None:
         self.lowering, self.jaxpr = lowering, closed.jaxpr
         self.values: dict[Any, Any] = {}
         self._let_go: dict[Any, None] = {}
@@ -26,7 +30,7 @@ class Environment:
         self._bind(self.jaxpr.invars, args, -1)
         self._bind(self.jaxpr.constvars, list(map(lowering.constant, closed.consts)), -1)
 
-    def _bind(self, variables: Any, values: list[Any], now: int) -> None:
+    def _bind(self, variables: Sequence[Any], values: Sequence[Operand], now: int) -> None:
         for v, x in zip(variables, values, strict=True):
             if self._last.get(v, -1) > now:
                 x = (
@@ -37,8 +41,8 @@ class Environment:
                 self.values[v] = x
                 retain(x, 1)
 
-    def _read(self, v: Any) -> Any:
-        return self.lowering.constant(np.asarray(v.val, v.aval.dtype)) if isinstance(v, Literal) else self.values[v]
+    def _read(self, v: Atom) -> Any:
+        return self.lowering.constant(np.asarray(v.val, aval_of(v).dtype)) if isinstance(v, Literal) else self.values[v]
 
     def operands(self, i: int) -> list[Any]:
         """The operands of equation i; those that nothing else needs are let go."""
@@ -49,7 +53,7 @@ class Environment:
             self._let_go.update(dict.fromkeys(getattr(x, "buffers", ())))
         return found
 
-    def give(self, i: int, values: list[Any]) -> None:
+    def give(self, i: int, values: Sequence[Operand]) -> None:
         """The results of equation i."""
         self._bind(self.jaxpr.eqns[i].outvars, values, i)
         self.lowering.memory.recycle(self._let_go)

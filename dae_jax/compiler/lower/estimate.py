@@ -11,6 +11,7 @@ from ..emit.target import vector_size
 from ..jaxprs.numbers import is_on_numbers
 from ..jaxprs.walk import equations
 from ..thresholds import THRESHOLDS
+from ..types import Aval, Equation
 from .annotated import Annotated, Note
 from .dtypes import BYTES, parts_of
 from .inlining import Inlining
@@ -45,7 +46,7 @@ class _Estimate:
         self.notes: list[Note] = []
         self.bytes = 0
 
-    def loaded(self, aval: Any, varying: bool) -> _State:
+    def loaded(self, aval: Aval, varying: bool) -> _State:
         """What a function, a loop or a branch gets or gives."""
         return _State("memory" if aval.size > THRESHOLDS.carried else "registers", self.lanes and varying)
 
@@ -68,19 +69,19 @@ class _Estimate:
             found.update(zip(eqn.outvars, outs, strict=True))
         return list(map(read, jaxpr.jaxpr.outvars))
 
-    def _note(self, eqn: Any, depth: int, varying: bool, storage: str, cost: int) -> None:
+    def _note(self, eqn: Equation, depth: int, varying: bool, storage: str, cost: int) -> None:
         self.notes.append(Note(depth, eqn, varying, storage, cost))
         self.bytes += sum(v.aval.size * _bytes(v.aval) for v in eqn.outvars if v.aval.size > self.few)
 
     def _plain(
-        self, eqn: Any, args: list[_State], varying: list[bool], depth: int, times: int, uses: int
+        self, eqn: Equation, args: list[_State], varying: list[bool], depth: int, times: int, uses: int
     ) -> list[_State]:
         storage, cost = self._of_equation(eqn, {state.storage for state in args}, uses)
         self._note(eqn, depth, any(varying), storage, cost * times)
         kept = lambda v: storage if storage in ("known", "fused") or v.aval.size > self.few else "registers"
         return [_State(kept(v), each) for v, each in zip(eqn.outvars, varying, strict=True)]
 
-    def _of_equation(self, eqn: Any, args: set[str], uses: int) -> tuple[str, int]:
+    def _of_equation(self, eqn: Equation, args: set[str], uses: int) -> tuple[str, int]:
         """Where the results are, and about how many instructions they take."""
         rule, largest = RULES[eqn.primitive.name], max(v.aval.size for v in eqn.outvars)
         folds = rule.moves or is_on_numbers(eqn)
@@ -93,7 +94,7 @@ class _Estimate:
         cost = sum(min(v.aval.size, THRESHOLDS.loop_cost) for v in eqn.outvars) * of_entry
         return ("fused" if fuses and uses == 1 else "memory" if rule.moves or largest > self.few else "registers"), cost
 
-    def _nested(self, eqn: Any, args: list[_State], varying: list[bool], depth: int, times: int) -> list[_State]:
+    def _nested(self, eqn: Equation, args: list[_State], varying: list[bool], depth: int, times: int) -> list[_State]:
         p, outs = eqn.params, [self.loaded(v.aval, each) for v, each in zip(eqn.outvars, varying, strict=True)]
         if eqn.primitive.name == "while":
             n, m = p["cond_nconsts"], p["body_nconsts"]
@@ -110,7 +111,7 @@ class _Estimate:
         return outs
 
 
-def is_written_out(eqn: Any) -> bool:
+def is_written_out(eqn: Equation) -> bool:
     """Whether the turns of a `scan` stand one after another."""
     p, of_ys = eqn.params, [v.aval for v in eqn.outvars[eqn.params["num_carry"] :]]
     total = p["length"] * (1 + sum(1 for _ in equations(p["jaxpr"])))
@@ -118,6 +119,6 @@ def is_written_out(eqn: Any) -> bool:
     return few or p["length"] <= 1
 
 
-def _bytes(aval: Any) -> int:
+def _bytes(aval: Aval) -> int:
     kind, count = parts_of(aval.dtype)
     return BYTES[kind] * count

@@ -8,19 +8,21 @@ import numpy as np
 
 from ..jaxprs.objects import is_number
 from .arithmetic import convert
-from .arrays import View
+from .arrays import Operand, View
 from .context import Context
-from .instructions import Instructions, Value
+from .instructions import Index, Instructions, Value
 
 
-Read = Callable[[list[Any]], Any]
+Read = Callable[[Sequence[Any]], Any]
 
 
-def window_start(context: Context, starts: Sequence[Any], first: int, shape: Any, sizes: Any) -> list[Any]:
+def window_start(
+    context: Context, starts: Sequence[Operand], first: int, shape: Sequence[int], sizes: Sequence[int]
+) -> list[Any]:
     """Where a window starts, moved inside the array; `first`: which operand the first of the starts is."""
     code, out = context.code, []
     for k, (start, n, size) in enumerate(zip(starts, shape, sizes, strict=True), first):
-        i = context.memory.entries(start)[()]
+        i = context.memory.number(start)
         if is_number(i):
             out.append(min(max(int(i), 0), n - size))
         elif n == size:
@@ -31,12 +33,12 @@ def window_start(context: Context, starts: Sequence[Any], first: int, shape: Any
     return out
 
 
-def indices_of(context: Context, indices: Any, looped: bool) -> Read:
+def indices_of(context: Context, indices: Operand, looped: bool) -> Read:
     """The indices of a gather or scatter as integers of 64 bits."""
     memory, dtype = context.memory, context.dtypes[1]
     indices = memory.view(indices, dtype) if looped else memory.entries(indices)
 
-    def read(index: list[Any]) -> Any:
+    def read(index: Sequence[Index]) -> Any:
         i = memory.entry(indices, index)
         return int(i) if is_number(i) else _index(context.code, i, dtype)
 
@@ -49,13 +51,20 @@ def _index(code: Instructions, i: Value, dtype: np.dtype) -> Value:
     return convert(code, i, dtype, np.dtype("int64"))
 
 
-def offsets_of(context: Context, x: View, read: Read, numbers: Any, sizes: Any, mode: Any) -> Read:
+def offsets_of(
+    context: Context,
+    x: View,
+    read: Read,
+    numbers: jax.lax.GatherDimensionNumbers,
+    sizes: Sequence[int],
+    mode: jax.lax.GatherScatterMode | str | None,
+) -> Read:
     """Where in `x` an entry of a gather's result is, and whether it is inside (`None`: in any case)."""
     dropped = {*numbers.collapsed_slice_dims, *numbers.operand_batching_dims}
     kept = [d for d in range(x.ndim) if d not in dropped]
     checked = jax.lax.GatherScatterMode.from_any(mode) is jax.lax.GatherScatterMode.FILL_OR_DROP
 
-    def place(index: list[Any]) -> tuple[Any, Any]:
+    def place(index: Sequence[Index]) -> tuple[Any, Any]:
         batch = [i for d, i in enumerate(index) if d not in numbers.offset_dims]
         window = dict(zip(kept, (index[d] for d in numbers.offset_dims), strict=True))
         found, inside = [window.get(d, 0) for d in range(x.ndim)], None
@@ -71,7 +80,7 @@ def offsets_of(context: Context, x: View, read: Read, numbers: Any, sizes: Any, 
     return place
 
 
-def _clipped(code: Instructions, start: Any, last: int) -> tuple[Any, Any]:
+def _clipped(code: Instructions, start: Index, last: int) -> tuple[Any, Any]:
     """A start moved inside the array, and whether it was there."""
     if isinstance(start, int):
         clipped = min(max(start, 0), last)

@@ -1,12 +1,12 @@
 """The jaxprs in a function without their calls, each inlined once."""
 
 from collections.abc import Iterator
-from typing import Any
 
 from jax.extend.core import ClosedJaxpr
 
 from ..jaxprs.inline import inlined
 from ..jaxprs.walk import jaxprs_in
+from ..types import Equation
 
 
 class Inlining:
@@ -21,6 +21,6 @@ class Inlining:
         return self._known[id(closed)][1]
 
 
-def inner(eqn: Any) -> Iterator[ClosedJaxpr]:
+def inner(eqn: Equation) -> Iterator[ClosedJaxpr]:
     """The jaxprs that a loop or a branch runs."""
     return (x for x in jaxprs_in(tuple(eqn.params.values())) if isinstance(x, ClosedJaxpr))

@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 import struct
 from collections.abc import Iterable, Iterator
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -31,6 +31,11 @@ class Complex:
 
     real: Any
     imag: Any
+
+
+# A number: the result of an instruction, or known. An index: the same of an integer of 64 bits.
+Number: TypeAlias = Value | Complex | np.number | np.bool_ | float
+Index: TypeAlias = Value | int
 
 
 class Instructions:
@@ -79,11 +84,11 @@ class Instructions:
         yield
         self._known.pop()
 
-    def text(self, x: Any, kind: str, lanes: bool = False) -> str:
+    def text(self, x: Number, kind: str, lanes: bool = False) -> str:
         """An operand without its type."""
         if isinstance(x, Value):
             return self.in_lanes(x).name if lanes else x.name
-        if np.iscomplexobj(x):
+        if isinstance(x, Complex) or np.iscomplexobj(x):
             raise TypeError("a complex number where a real one is written")
         if kind == "double" or kind == "float":
             literal = f"0x{struct.pack('>d', float(x)).hex().upper()}"
@@ -91,7 +96,7 @@ class Instructions:
             literal = ("true" if x else "false") if kind == "i1" else str(int(x))
         return f"splat ({kind} {literal})" if lanes else literal
 
-    def operand(self, x: Any, kind: str, lanes: bool = False) -> str:
+    def operand(self, x: Number, kind: str, lanes: bool = False) -> str:
         """An operand with its type."""
         return f"{self.type(kind, lanes)} {self.text(x, kind, lanes)}"
 
@@ -105,13 +110,13 @@ class Instructions:
             f"shufflevector {vector} {one.name}, {vector} poison, <{self.width} x i32> zeroinitializer", x.kind, True
         )
 
-    def lane(self, x: Any, kind: str, k: int) -> Any:
+    def lane(self, x: Number, kind: str, k: int) -> Any:
         """The number of one lane."""
         if not isinstance(x, Value) or not x.lanes:
             return x
         return self.pure(f"extractelement {self.type(kind, True)} {x.name}, i64 {k}", kind, False)
 
-    def of_lanes(self, kind: str, numbers: Iterable[Any]) -> Value:
+    def of_lanes(self, kind: str, numbers: Iterable[Number]) -> Value:
         """One number for each lane."""
         vector = "poison"
         out = None
@@ -139,7 +144,7 @@ class Instructions:
         """A block ends, and the one of this name comes next."""
         self.lines.append(f"br label %{name}")
 
-    def branch(self, condition: Any, yes: str, no: str) -> None:
+    def branch(self, condition: Value, yes: str, no: str) -> None:
         """A block ends, and one of two comes next."""
         self.lines.append(f"br i1 {condition.name}, label %{yes}, label %{no}")
 
@@ -152,7 +157,7 @@ class Instructions:
 
     # Instructions
 
-    def _in_lanes(self, xs: Iterable[Any]) -> bool:
+    def _in_lanes(self, xs: Iterable[Number]) -> bool:
         """Whether any of the operands differs from lane to lane."""
         if self.width > 1:
             for x in xs:
@@ -160,7 +165,7 @@ class Instructions:
                     return True
         return False
 
-    def op(self, code: str, kind: str, *xs: Any, result: str | None = None) -> Value:
+    def op(self, code: str, kind: str, *xs: Number, result: str | None = None) -> Value:
         """An instruction whose operands have one type."""
         lanes = self._in_lanes(xs)
         texts = [self.text(x, kind, lanes) for x in xs]
@@ -178,7 +183,7 @@ class Instructions:
         self._scaled[out.name] = base, factor
         return out
 
-    def intrinsic(self, name: str, kind: str, *xs: Any) -> Value:
+    def intrinsic(self, name: str, kind: str, *xs: Number) -> Value:
         lanes = self._in_lanes(xs)
         vector = self.type(kind, lanes)
         suffix = kind.replace("double", "f64").replace("float", "f32")
@@ -188,7 +193,7 @@ class Instructions:
             f"call {vector} {function}({', '.join(self.operand(x, kind, lanes) for x in xs)})", kind, lanes
         )
 
-    def library(self, name: str, kind: str, *xs: Any) -> Value:
+    def library(self, name: str, kind: str, *xs: Number) -> Value:
         """A function of the C library, lane by lane where it has none for vectors."""
         name = name if kind == "double" else f"{name}f"
         function = self.function(name, kind, *[kind] * len(xs))
@@ -202,7 +207,7 @@ class Instructions:
             return self._by_vectors(many, kind, xs)
         return self.of_lanes(kind, [call([self.lane(x, kind, k) for x in xs]) for k in range(self.width)])
 
-    def _by_vectors(self, name: str, kind: str, xs: tuple[Any, ...]) -> Value:
+    def _by_vectors(self, name: str, kind: str, xs: tuple[Number, ...]) -> Value:
         """A function for vectors of the machine's size."""
         size = vector_size()
         vector = f"<{size} x {kind}>"
@@ -236,10 +241,10 @@ class Instructions:
         function = self.function(f"llvm.vector.reduce.or.v{self.width}i1", "i1", vector)
         return self.pure(f"call i1 {function}({vector} {x.name})", "i1", False)
 
-    def select(self, condition: Any, yes: Any, no: Any, kind: str) -> Any:
+    def select(self, condition: Number, yes: Number, no: Number, kind: str) -> Any:
         if yes is no:
             return yes
-        if any(isinstance(x, Complex) or np.iscomplexobj(x) for x in (yes, no)):
+        if any(isinstance(x, Complex | np.complexfloating) for x in (yes, no)):
             (a, b), (c, d) = parts(yes), parts(no)
             return Complex(self.select(condition, a, c, kind), self.select(condition, b, d, kind))
         if not isinstance(condition, Value):
@@ -250,7 +255,7 @@ class Instructions:
             f"select {which}, {self.operand(yes, kind, lanes)}, {self.operand(no, kind, lanes)}", kind, lanes
         )
 
-    def times(self, a: Any, b: Any) -> Any:
+    def times(self, a: Index, b: Index) -> Any:
         """The product of two indices."""
         if isinstance(a, int) and isinstance(b, int):
             return a * b
@@ -259,7 +264,7 @@ class Instructions:
             return 0 if number == 0 else value if number == 1 else self.op("mul", "i64", value, number)
         return self.op("mul", "i64", a, b)
 
-    def plus(self, a: Any, b: Any) -> Any:
+    def plus(self, a: Index, b: Index) -> Any:
         """The sum of two indices."""
         if isinstance(a, int) and isinstance(b, int):
             return a + b
@@ -267,7 +272,7 @@ class Instructions:
             return b
         return a if isinstance(b, int) and b == 0 else self.op("add", "i64", a, b)
 
-    def copy(self, x: Any, kind: str) -> Value:
+    def copy(self, x: Number, kind: str) -> Value:
         """A value in any case."""
         return x if isinstance(x, Value) else Value(self.text(x, kind), kind)
 
@@ -277,8 +282,10 @@ class Instructions:
         return self.pure(f"{code} {self.type(x.kind, x.lanes)} {x.name} to {self.type(kind, lanes)}", kind, lanes)
 
 
-def parts(x: Any) -> tuple[Any, Any]:
+def parts(x: Number) -> tuple[Any, Any]:
     """The real and the imaginary part of a number."""
     if isinstance(x, Complex):
         return x.real, x.imag
-    return (np.float64(x.real), np.float64(x.imag)) if np.iscomplexobj(x) else (x, np.float64(0))
+    if isinstance(x, np.complexfloating):
+        return np.float64(x.real), np.float64(x.imag)
+    return x, np.float64(0)

@@ -2,9 +2,8 @@
 
 import functools
 from collections.abc import Iterator
-from typing import Any
 
-import jax
+from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr
 
 from ..emit import available
@@ -12,6 +11,7 @@ from ..emit.target import Target, host
 from ..jaxprs.random_keys import without_keys
 from ..jaxprs.scalar_interpreter import Unsupported
 from ..thresholds import THRESHOLDS
+from ..types import Equation
 from . import estimate, rules as rules
 from .annotated import Annotated
 from .dtypes import ALL
@@ -57,7 +57,7 @@ def _unsupported(jaxpr: ClosedJaxpr, inlined: Inlining) -> Iterator[Unsupported]
 
 
 def _unsupported_within(jaxpr: ClosedJaxpr, inlined: Inlining) -> Iterator[Unsupported]:
-    if any(isinstance(x, jax.core.Tracer) for x in jaxpr.consts):
+    if any(isinstance(x, Tracer) for x in jaxpr.consts):
         yield Unsupported("a constant is being traced", primitive="constant")
     for eqn in jaxpr.jaxpr.eqns:
         reason = _reason(eqn)
@@ -68,7 +68,7 @@ def _unsupported_within(jaxpr: ClosedJaxpr, inlined: Inlining) -> Iterator[Unsup
                 yield from _unsupported_within(inlined(body), inlined)
 
 
-def _reason(eqn: Any) -> str | None:
+def _reason(eqn: Equation) -> str | None:
     name = eqn.primitive.name
     if eqn.effects:
         return f"`{name}` has side effects"

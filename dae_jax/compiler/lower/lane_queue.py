@@ -15,11 +15,12 @@ from jax.extend.core import ClosedJaxpr
 from ..jaxprs.objects import objects
 from ..jaxprs.walk import equations, equations_in
 from ..thresholds import THRESHOLDS
-from .arrays import View
+from ..types import Aval, Params
+from .arrays import Operand, View
 from .carry import kept_apart
 from .dtypes import kinds_of
 from .environment import Environment
-from .instructions import Complex, Value
+from .instructions import Complex, Number, Value
 from .lowering import Lowering
 from .operands import has_lanes, of_texts, retain, texts
 from .uniformity import varying_in_loop
@@ -94,7 +95,9 @@ class LaneQueue:
         code.label(done)
         code.mask = None
 
-    def _turn(self, p: Any, consts: list[Any], row: Value, idle: Value, blocks: tuple[str, str, str, str]) -> None:
+    def _turn(
+        self, p: Params, consts: list[Operand], row: Value, idle: Value, blocks: tuple[str, str, str, str]
+    ) -> None:
         """A turn of the lanes whose condition holds, unless a compaction is due or all are done."""
         code, n = self.code, p["cond_nconsts"]
         compaction, onwards, body, done = blocks
@@ -104,7 +107,7 @@ class LaneQueue:
         (goes_on,) = self.lowering.run(p["cond_jaxpr"], [*consts[:n], *self.carry])
         for x in self.carry:
             retain(x, -1)
-        goes_on = code.in_lanes(code.copy(self.memory.entries(goes_on)[()], "i1"))
+        goes_on = code.in_lanes(code.copy(self.memory.number(goes_on), "i1"))
         going = code.op("and", "i1", code.mask, goes_on)
         code.lines.append(f"{self.free.name} = xor {code.type('i1', True)} {going.name}, splat (i1 true)")
         now, idled = self._compaction_due(code.mask, going, row, idle)
@@ -190,7 +193,7 @@ class LaneQueue:
         start = code.write(f"atomicrmw add ptr %taken, i64 {count.name} monotonic", "i64", False)
         return code.op("add", "i64", code.op("sub", "i64", total, one), start)
 
-    def _carried(self, aval: Any) -> Any:
+    def _carried(self, aval: Aval) -> Any:
         """What the loop carries: entries as phi nodes, large arrays in a buffer of the loop's own."""
         code = self.code
         if aval.size > THRESHOLDS.carried:
@@ -198,7 +201,7 @@ class LaneQueue:
         names = [self._phi(code.type(kind, True), "zeroinitializer") for kind in kinds_of(aval)]
         return of_texts(names, aval, True)
 
-    def _kept(self, x: Any, new: list[tuple[Any, Any]]) -> Any:
+    def _kept(self, x: Operand, new: list[tuple[list[str], Value]]) -> Any:
         """A value from before the loop that is needed later."""
         if isinstance(x, View):
             if x.buffer.lanes:
@@ -208,11 +211,11 @@ class LaneQueue:
             Complex(self._kept_part(e.real, new), self._kept_part(e.imag, new))
             if isinstance(e, Complex)
             else self._kept_part(e, new)
-            for e in x.ravel()
+            for e in self.memory.entries(x).ravel()
         ]
         return objects(entries, x.shape)
 
-    def _kept_part(self, x: Any, new: list[tuple[Any, Any]]) -> Any:
+    def _kept_part(self, x: Number, new: list[tuple[list[str], Value]]) -> Any:
         if not isinstance(x, Value):
             return x
         code = self.code
@@ -220,7 +223,7 @@ class LaneQueue:
         new.append((self.phis[-1], x))
         return Value(name, x.kind, x.lanes)
 
-    def _replace(self, values: list[Any], mask: Value, edge: int) -> None:
+    def _replace(self, values: list[Operand], mask: Value, edge: int) -> None:
         """What is carried, replaced in some lanes."""
         code = self.code
         phis = {phi[0]: phi for phi in self.phis}

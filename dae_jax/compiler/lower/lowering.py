@@ -4,11 +4,14 @@ from typing import Any
 
 import numpy as np
 from jax.extend.core import ClosedJaxpr
+from jax.typing import ArrayLike
 
 from ..jaxprs.numbers import on_numbers
 from ..jaxprs.objects import is_number, objects
 from ..thresholds import THRESHOLDS
+from ..types import Equation
 from . import rules as rules
+from .arrays import Operand
 from .context import Context
 from .environment import Environment
 from .inlining import Inlining
@@ -36,20 +39,20 @@ class Lowering:
         self.memory = Memory(self.code, always_copies)
         self._limit, self._inlined = limit, inlined
 
-    def run(self, closed: ClosedJaxpr, args: list[Any]) -> list[Any]:
+    def run(self, closed: ClosedJaxpr, args: list[Operand]) -> list[Any]:
         """Writes a jaxpr; gives its results."""
         environment = Environment(self, self._inlined(closed), args)
         environment.advance(0, len(environment.jaxpr.eqns))
         return environment.results()
 
-    def constant(self, x: Any) -> Any:
+    def constant(self, x: ArrayLike) -> Any:
         """Known numbers; many of them are data of the module."""
         x = np.asarray(x)
         if x.size > THRESHOLDS.folded:
             return self.memory.constant_view(x)
         return objects([x[i] for i in np.ndindex(x.shape)], x.shape)
 
-    def equation(self, eqn: Any, args: list[Any]) -> list[Any]:
+    def equation(self, eqn: Equation, args: list[Operand]) -> list[Any]:
         """Writes an equation; gives its results."""
         rule = RULES[eqn.primitive.name]
         try:
@@ -66,7 +69,7 @@ class Lowering:
             raise TooLarge
         return out
 
-    def _is_large(self, rule: Rule, eqn: Any, args: list[Any]) -> bool:
+    def _is_large(self, rule: Rule, eqn: Equation, args: list[Operand]) -> bool:
         """Whether an operand is in memory, or the result is so large that it shall be."""
         largest = max((v.aval.size for v in eqn.outvars), default=0)
         if largest > THRESHOLDS.folded or (largest > THRESHOLDS.in_registers and not _stays_known(rule, eqn, args)):
@@ -74,7 +77,7 @@ class Lowering:
         return any(not isinstance(a, np.ndarray) and a.size > self.memory.few for a in args)
 
 
-def _check(eqn: Any, out: list[Any]) -> None:
+def _check(eqn: Equation, out: list[Operand]) -> None:
     """What has another shape or type than the equation says would be read and written past its end."""
     for v, x in zip(eqn.outvars, out, strict=True):
         dtype = v.aval.dtype if isinstance(x, np.ndarray) else x.dtype
@@ -82,11 +85,12 @@ def _check(eqn: Any, out: list[Any]) -> None:
             raise AssertionError(f"it gave {dtype}{list(x.shape)}")
 
 
-def _stays_known(rule: Rule, eqn: Any, args: list[Any]) -> bool:
+def _stays_known(rule: Rule, eqn: Equation, args: list[Operand]) -> bool:
     """Whether all operands are numbers, and the results are then too, without an instruction."""
-    if not all(isinstance(a, np.ndarray) and all(map(is_number, a.ravel())) for a in args):
+    known = [a for a in args if isinstance(a, np.ndarray) and all(map(is_number, a.ravel()))]
+    if len(known) < len(args):
         return False
     if rule.moves:
         return True
-    values = [np.array(list(a.ravel()), v.aval.dtype).reshape(a.shape) for a, v in zip(args, eqn.invars, strict=True)]
+    values = [np.array(list(a.ravel()), v.aval.dtype).reshape(a.shape) for a, v in zip(known, eqn.invars, strict=True)]
     return on_numbers(eqn, values) is not None

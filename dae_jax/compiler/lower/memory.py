@@ -10,11 +10,12 @@ import numpy as np
 
 from ..jaxprs.objects import is_number, objects
 from ..thresholds import THRESHOLDS
+from ..types import DType
 from .access import load, store
-from .arrays import Buffer, Fused, View, row_major
+from .arrays import Buffer, Fused, Operand, View, row_major
 from .blocks import for_each
 from .dtypes import BYTES, parts_of
-from .instructions import Instructions
+from .instructions import Index, Instructions, Number
 
 
 class Memory:
@@ -32,7 +33,7 @@ class Memory:
         self.recycles = not always_copies
         self.constants: list[str] = []
 
-    def at(self, view: View, index: Sequence[Any]) -> Any:
+    def at(self, view: View, index: Sequence[Index]) -> Any:
         """The place of an entry in the buffer."""
         place = view.offset
         for i, stride in zip(index, view.strides, strict=True):
@@ -60,7 +61,7 @@ class Memory:
                 self.free.setdefault(buffer.bytes, []).append(buffer.pointer)
                 buffer.bytes = 0
 
-    def new(self, dtype: Any, shape: Sequence[int]) -> View:
+    def new(self, dtype: DType, shape: Sequence[int]) -> View:
         dtype = np.dtype(dtype)
         shape = tuple(shape)
         return View(dtype, shape, self._buffer(dtype, max(math.prod(shape), 1)), row_major(shape))
@@ -71,24 +72,29 @@ class Memory:
         stored = "i8" if kind == "i1" else kind
         name = f"@{{name}}.{self.code.name()}"
         numbers = np.ascontiguousarray(x).ravel()
-        numbers = numbers.view(numbers.real.dtype) if parts == 2 else numbers
+        numbers = numbers.view(np.real(numbers).dtype) if parts == 2 else numbers
         texts = ", ".join(f"{stored} {self.code.text(y, kind) if kind != 'i1' else int(y)}" for y in numbers)
         self.constants.append(f"{name} = private constant [{len(numbers)} x {stored}] [{texts}], align 64")
         return View(x.dtype, x.shape, Buffer(name, kind, False, writable=False, parts=parts), row_major(x.shape))
 
-    def entry(self, x: Any, index: Sequence[Any]) -> Any:
+    def entry(self, x: Operand, index: Sequence[Index]) -> Any:
         """One entry of an array."""
         if isinstance(x, View):
             return load(self.code, x.buffer, self.at(x, index))
-        return x.read(index) if isinstance(x, Fused) else x[tuple(index)] if x.ndim else x[()]
+        known: Any = tuple(index)
+        return x.read(index) if isinstance(x, Fused) else x[known] if x.ndim else x[()]
 
-    def entries(self, x: Any) -> np.ndarray:
+    def entries(self, x: Operand) -> np.ndarray:
         """An array as entries."""
         if isinstance(x, np.ndarray):
             return x
         return objects([self.entry(x, i) for i in np.ndindex(x.shape)], x.shape)
 
-    def flat(self, x: Any) -> Callable[[Any], Any] | None:
+    def number(self, x: Operand) -> Any:
+        """An array's only entry."""
+        return self.entries(x)[()]
+
+    def flat(self, x: Operand) -> Callable[[Any], Any] | None:
         """How an entry is read by its place in row-major order, where that is as simple as by its index."""
         if isinstance(x, View) and x.contiguous:
             return lambda place: load(self.code, x.buffer, self.code.plus(x.offset, place))
@@ -96,7 +102,7 @@ class Memory:
             return lambda place: self.entry(x, [place])
         return x.flat if isinstance(x, Fused) else None
 
-    def view(self, x: Any, dtype: Any) -> View:
+    def view(self, x: Operand, dtype: DType) -> View:
         """An array in memory."""
         if isinstance(x, View):
             return x
@@ -114,36 +120,36 @@ class Memory:
                 store(self.code, out.buffer, k, number)
         return out
 
-    def materialised(self, x: Any) -> Any:
+    def materialised(self, x: Operand) -> Any:
         """An array whose entries are known from here on."""
         if not isinstance(x, Fused):
             return x
         return self.view(x, x.dtype) if x.size > self.few else self.entries(x)
 
-    def made(self, dtype: Any, shape: Sequence[int], entry: Callable[[list[Any]], Any]) -> View:
+    def made(self, dtype: DType, shape: Sequence[int], entry: Callable[[Sequence[Index]], Number]) -> View:
         """A new array, entry by entry."""
         return self.copied(Fused(np.dtype(dtype), tuple(shape), entry, ()), dtype)
 
-    def copied(self, x: Any, dtype: Any) -> View:
+    def copied(self, x: Operand, dtype: DType) -> View:
         """A new array with the same entries."""
         out = self.new(dtype, x.shape)
         self.assign(out, x, fresh=True)
         return out
 
-    def own(self, x: Any, dtype: Any) -> View:
+    def own(self, x: Operand, dtype: DType) -> View:
         """The array if nothing else refers to it, else a copy."""
         if isinstance(x, View) and x.buffer.writable and not x.buffer.references and x.whole and not self.always_copies:
             return x
         return self.copied(x, dtype)
 
-    def row(self, x: View, i: Any) -> View:
+    def row(self, x: View, i: Index) -> View:
         """x[i]."""
         return View(x.dtype, x.shape[1:], x.buffer, x.strides[1:], self.at(x, [i, *[0] * (x.ndim - 1)]))
 
-    def assign(self, to: View, x: Any, fresh: bool = False) -> None:
+    def assign(self, to: View, x: Operand, fresh: bool = False) -> None:
         """Copies the entries of `x`, in the lanes that take part; `fresh`: nothing else sees that memory yet."""
 
-        def put(place: Any, number: Any) -> None:
+        def put(place: Index, number: Number) -> None:
             with self.code.unmasked() if fresh else contextlib.nullcontext():
                 store(self.code, to.buffer, place, number)
 

@@ -4,14 +4,15 @@ from collections.abc import Sequence
 from typing import Any
 
 from ..thresholds import THRESHOLDS
-from .arrays import Buffer, View
+from ..types import Aval
+from .arrays import Buffer, Operand, View
 from .dtypes import kinds_of
 from .instructions import Value
 from .memory import Memory
 from .operands import has_lanes, of_texts, texts
 
 
-def hold(xs: list[Any]) -> list[Buffer]:
+def hold(xs: Sequence[Operand]) -> list[Buffer]:
     """Keeps the memory of arrays; gives what was not kept before."""
     found = [buffer for x in xs for buffer in getattr(x, "buffers", ()) if not buffer.held]
     for buffer in found:
@@ -22,19 +23,20 @@ def hold(xs: list[Any]) -> list[Buffer]:
 class Merged:
     """Entries as phi nodes, large arrays in the buffer that all branches share or in a new one."""
 
-    def __init__(self, memory: Memory, aval: Any) -> None:
+    def __init__(self, memory: Memory, aval: Aval) -> None:
         self.memory, self.aval = memory, aval
         large = aval.size > THRESHOLDS.carried
         self.kinds = [] if large else kinds_of(aval)
         self.view: View | None = memory.new(aval.dtype, aval.shape) if large else None
 
-    def receive(self, values: Sequence[Any], each: bool) -> None:
+    def receive(self, values: Sequence[Operand], each: bool) -> None:
         """What each branch gives, when all have been written; `each`: lanes take branches of their own."""
         self.values = values
         self.lanes = each or any(map(has_lanes, values))
         self.texts = ["zeroinitializer" if self.lanes else "poison"] * len(self.kinds)
         first = values[0]
-        if self.view and all(isinstance(x, View) and x.buffer is first.buffer and x.whole for x in values):
+        same = lambda x: isinstance(x, View) and isinstance(first, View) and x.buffer is first.buffer and x.whole
+        if self.view and isinstance(first, View) and all(map(same, values)):
             self.memory.recycle([self.view.buffer])
             self.view = first
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 from jax.extend.core import ClosedJaxpr
+from jaxtyping import Array
 
 from ..emit import register
 from ..emit.target import Target, host
@@ -37,7 +38,7 @@ def compiled(jaxpr: ClosedJaxpr, batched: Sequence[bool] = (), always_copies: bo
     name = register(written(jaxpr, tuple(batched), always_copies), jaxpr)
     first = list(batched).index(True) if any(batched) else None
 
-    def call(*xs: Any) -> list[Any]:
+    def call(*xs: Array) -> list[Any]:
         lead = () if first is None else (xs[first].shape[0],)
         structs = [jax.ShapeDtypeStruct((*lead, *v.aval.shape), v.aval.dtype) for v in jaxpr.jaxpr.outvars]
         return list(jax.ffi.ffi_call(name, structs)(*xs))

@@ -8,9 +8,10 @@ import numpy as np
 from ..emit.interface import batch_size, buffer
 from ..emit.runtime import alone, heap, in_threads
 from ..thresholds import THRESHOLDS
+from ..types import Aval
 from .access import store
 from .annotated import Annotated
-from .arrays import Buffer, View, row_major
+from .arrays import Buffer, Operand, View, row_major
 from .dtypes import parts_of
 from .instructions import Value
 from .lane_queue import LaneQueue, NotQueued, main_loop
@@ -85,7 +86,7 @@ class _Module:
             args.append(x if x.size > THRESHOLDS.carried else self.memory.entries(x))
         return args
 
-    def _store(self, results: list[Any], row: Value | None, mask: Value | None) -> None:
+    def _store(self, results: list[Operand], row: Value | None, mask: Value | None) -> None:
         """Stores the results of the element that each lane has, in the lanes of the mask."""
         code, memory = self.code, self.memory
         before, code.mask = code.mask, mask
@@ -98,7 +99,7 @@ class _Module:
                 store(code, to.buffer, memory.at(to, index), memory.entry(x, index))
         code.mask = before
 
-    def _view(self, pointer: str, aval: Any, row: Value | None, writable: bool) -> View:
+    def _view(self, pointer: str, aval: Aval, row: Value | None, writable: bool) -> View:
         kind, parts = parts_of(aval.dtype)
         buffer = Buffer(pointer, kind, False, writable, parts)
         place = 0 if row is None else self.code.times(row, aval.size)

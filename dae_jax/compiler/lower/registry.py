@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ..types import Aval, DType, Equation
 from .dtypes import ALL
 
 
@@ -34,7 +35,7 @@ class Rule:
     fuses: bool
     nested: bool
 
-    def unsupported(self, eqn: Any) -> str | None:
+    def unsupported(self, eqn: Equation) -> str | None:
         """Why this equation cannot be compiled, or `None`."""
         for k, v in enumerate(eqn.invars):
             allowed = self.dtypes[min(k, len(self.dtypes) - 1)]
@@ -49,17 +50,17 @@ class Rule:
 RULES: dict[str, Rule] = {}
 
 
-def size(eqn: Any) -> int:
+def size(eqn: Equation) -> int:
     """An instruction for each entry of the results."""
     return sum(v.aval.size for v in eqn.outvars)
 
 
-def free(_: Any) -> int:
+def free(_: object) -> int:
     """No instruction: entries in registers are only called differently."""
     return 0
 
 
-def always(_: Any) -> None:
+def always(_: object) -> None:
     """Nothing more is required."""
 
 
@@ -86,17 +87,17 @@ def rule(
     return enter
 
 
-def quoted(eqn: Any) -> str:
+def quoted(eqn: Equation) -> str:
     """An equation in short, as `f64[3] = sin f64[3]`."""
     outs, ins = (" ".join(v.aval.str_short(short_dtypes=True) for v in vs) for vs in (eqn.outvars, eqn.invars))
     return f"{outs} = {eqn.primitive.name} {ins}".strip()
 
 
-def named(aval: Any) -> str:
+def named(aval: Aval) -> str:
     """The name of a type of numbers."""
     return _name(getattr(aval, "dtype", None))
 
 
 @functools.cache
-def _name(dtype: Any) -> str:
+def _name(dtype: DType) -> str:
     return np.dtype(dtype).name if isinstance(dtype, np.dtype | type) else str(dtype)

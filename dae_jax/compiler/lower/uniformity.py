@@ -10,6 +10,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from ..jaxprs.walk import called
 from ..thresholds import THRESHOLDS
+from ..types import Equation, Params
 from .registry import RULES
 
 
@@ -27,7 +28,7 @@ def varying(jaxpr: ClosedJaxpr | Jaxpr, inputs: Sequence[bool], in_memory: bool 
     return list(map(read, jaxpr.outvars))
 
 
-def results(eqn: Any, args: list[bool], in_memory: bool = True) -> list[bool]:
+def results(eqn: Equation, args: list[bool], in_memory: bool = True) -> list[bool]:
     """For each result of an equation whether it may."""
     name, p, n = eqn.primitive.name, eqn.params, len(eqn.outvars)
     inner = called(eqn)
@@ -50,7 +51,7 @@ def results(eqn: Any, args: list[bool], in_memory: bool = True) -> list[bool]:
     return [any(args) or large or by_memory] * n
 
 
-def varying_in_loop(p: Any, args: list[list[bool]], in_memory: bool = True) -> list[bool]:
+def varying_in_loop(p: Params, args: list[list[bool]], in_memory: bool = True) -> list[bool]:
     """What a `while` loop carries; all of it if some lanes go on longer than others."""
     of_cond, of_body, carry = args
     while True:

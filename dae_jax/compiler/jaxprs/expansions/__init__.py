@@ -4,14 +4,17 @@ A function gets the operands and the parameters of the equation, and gives the r
 them. It raises `Unsupported` for what it does not take.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import eval_jaxpr
 from jax.extend.core import ClosedJaxpr
+from jaxtyping import Array
 
+from ...types import Arrays, DType, Equation
 from ..rewriting import Rewriting
 from ..walk import equations
 from .factorisations import cholesky, lu, lu_pivots_to_permutation
@@ -20,12 +23,12 @@ from .sorting import sort
 from .triangular import triangular_solve
 
 
-def _platform_index(*, platforms: Any, **_: Any) -> np.int32:
+def _platform_index(*, platforms: Sequence[Sequence[str] | None], **_: object) -> np.int32:
     """Which of several implementations is for the CPU."""
     return np.int32(next(i for i, names in enumerate(platforms) if names is None or "cpu" in names))
 
 
-def _empty(*, dtype: Any, **_: Any) -> Any:
+def _empty(*, dtype: DType, **_: object) -> Any:
     return jnp.zeros((), dtype)
 
 
@@ -50,21 +53,21 @@ def expanded(closed: ClosedJaxpr) -> ClosedJaxpr:
     if not any(map(_is_expanded, equations(closed))):
         return closed
 
-    def fn(*args: Any) -> list[Any]:
+    def fn(*args: Array) -> list[Any]:
         return rewriting.run(closed.jaxpr, closed.consts, args, [])[0]
 
     rewriting = Rewriting(_is_expanded, lambda eqn, args, state: (_results(eqn, args), state))
     return jax.make_jaxpr(fn)(*closed.in_avals)
 
 
-def _is_expanded(eqn: Any) -> bool:
+def _is_expanded(eqn: Equation) -> bool:
     return eqn.primitive.name in EXPANSIONS or eqn.primitive.name == _LINEAR_SOLVE
 
 
-def _results(eqn: Any, args: list[Any]) -> list[Any]:
+def _results(eqn: Equation, args: Arrays) -> list[Any]:
     name, params = eqn.primitive.name, eqn.primitive.get_bind_params(eqn.params)
     if name in EXPANSIONS:
         out = EXPANSIONS[name](*args, **params)
         return list(out) if eqn.primitive.multiple_results else [out]
     inner = expanded(jax.make_jaxpr(lambda *xs: eqn.primitive.impl(*xs, **params))(*args))
-    return jax.core.eval_jaxpr(inner.jaxpr, inner.consts, *args)
+    return eval_jaxpr(inner.jaxpr, inner.consts, *args)

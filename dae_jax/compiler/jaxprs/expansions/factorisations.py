@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from ...thresholds import THRESHOLDS
 from ..scalar_interpreter import Unsupported
@@ -25,7 +26,7 @@ def of_batch(fn: Callable[..., Any], batch: int) -> Callable[..., Any]:
     return fn
 
 
-def lu(a: Any, **_: Any) -> tuple[Any, Any, Any]:
+def lu(a: Array, **_: object) -> tuple[Any, Any, Any]:
     """L and U in one matrix, the rows that were exchanged, and the permutation; as LAPACK's getrf.
 
     A column of zeros is no pivot and stays as it is.
@@ -35,11 +36,11 @@ def lu(a: Any, **_: Any) -> tuple[Any, Any, Any]:
     return of_batch(_lu_written_out if max(m, n) <= THRESHOLDS.matrix_written_out else _lu_in_loop, a.ndim - 2)(a)
 
 
-def _size(x: Any) -> Any:
+def _size(x: Array) -> Any:
     return jnp.abs(x.real) + jnp.abs(x.imag) if jnp.iscomplexobj(x) else jnp.abs(x)
 
 
-def _lu_written_out(a: Any) -> tuple[Any, Any, Any]:
+def _lu_written_out(a: Array) -> tuple[Any, Any, Any]:
     m, n = a.shape
     rows = [[a[i, j] for j in range(n)] for i in range(m)]
     order: list[Any] = [jnp.int32(i) for i in range(m)]
@@ -67,11 +68,11 @@ def _lu_written_out(a: Any) -> tuple[Any, Any, Any]:
     return jnp.stack([jnp.stack(row) for row in rows]), jnp.stack(pivots), jnp.stack(order)
 
 
-def _lu_in_loop(a: Any) -> tuple[Any, Any, Any]:
+def _lu_in_loop(a: Array) -> tuple[Any, Any, Any]:
     m, n = a.shape
     row, column = jnp.arange(m), jnp.arange(n)
 
-    def eliminate(k: Any, carry: Any) -> Any:
+    def eliminate(k: Array | int, carry: tuple[Array, ...]) -> Any:
         a, pivots, order = carry
         sizes = _size(a[:, k])
         # What is not a number is a pivot only where it stands.
@@ -89,11 +90,11 @@ def _lu_in_loop(a: Any) -> tuple[Any, Any, Any]:
     return jax.lax.fori_loop(0, min(m, n), eliminate, start)
 
 
-def lu_pivots_to_permutation(pivots: Any, *, permutation_size: int, **_: Any) -> Any:
+def lu_pivots_to_permutation(pivots: Array, *, permutation_size: int, **_: object) -> Any:
     """The order of the rows after the exchanges."""
     count = pivots.shape[-1]
 
-    def permutation(pivots: Any) -> Any:
+    def permutation(pivots: Array) -> Any:
         order = jnp.arange(permutation_size, dtype=jnp.int32)
         for k in range(count):
             j = pivots[k]
@@ -105,14 +106,14 @@ def lu_pivots_to_permutation(pivots: Any, *, permutation_size: int, **_: Any) ->
     return of_batch(permutation, pivots.ndim - 1)(pivots)
 
 
-def cholesky(a: Any, **_: Any) -> Any:
+def cholesky(a: Array, **_: object) -> Any:
     """L with L Lᴴ = a, of its lower half; not a number where a is not positive definite."""
     refuse_large("cholesky", a.shape[-1])
     n = a.shape[-1]
     return of_batch(_cholesky_written_out if n <= THRESHOLDS.matrix_written_out else _cholesky_in_loop, a.ndim - 2)(a)
 
 
-def _cholesky_written_out(a: Any) -> Any:
+def _cholesky_written_out(a: Array) -> Any:
     n = len(a)
     zero = jnp.zeros((), a.dtype)
     found: list[list[Any]] = [[zero] * n for _ in range(n)]
@@ -128,15 +129,15 @@ def _cholesky_written_out(a: Any) -> Any:
     return jnp.where(definite, jnp.stack([jnp.stack(row) for row in found]), jnp.nan)
 
 
-def _size_squared(x: Any) -> Any:
+def _size_squared(x: Array) -> Any:
     return x.real**2 + x.imag**2 if jnp.iscomplexobj(x) else x * x
 
 
-def _cholesky_in_loop(a: Any) -> Any:
+def _cholesky_in_loop(a: Array) -> Any:
     n = len(a)
     row = jnp.arange(n)
 
-    def column(j: Any, carry: Any) -> Any:
+    def column(j: Array | int, carry: Array) -> Any:
         found, definite = carry
         rest = a[:, j] - found @ found[j].conj()
         square = rest[j].real

@@ -4,12 +4,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from ..scalar_interpreter import Unsupported
 from .factorisations import of_batch, refuse_large
 
 
-def qr(a: Any, *, pivoting: bool, full_matrices: bool, **_: Any) -> tuple[Any, Any]:
+def qr(a: Array, *, pivoting: bool, full_matrices: bool, **_: object) -> tuple[Any, Any]:
     """Q and R."""
     if pivoting:
         raise Unsupported("qr with pivoting")
@@ -20,17 +21,17 @@ def qr(a: Any, *, pivoting: bool, full_matrices: bool, **_: Any) -> tuple[Any, A
     return householder_product(wide, taus), jnp.triu(reflections[..., :k, :])
 
 
-def geqrf(a: Any, **_: Any) -> tuple[Any, Any]:
+def geqrf(a: Array, **_: object) -> tuple[Any, Any]:
     """R, the reflections' vectors below it, and their factors τ, as LAPACK has them: H = 1 − τ v vᴴ with v₀ = 1."""
     refuse_large("geqrf", *a.shape[-2:])
     return of_batch(_reflected, a.ndim - 2)(a)
 
 
-def _reflected(a: Any) -> tuple[Any, Any]:
+def _reflected(a: Array) -> tuple[Any, Any]:
     m, n = a.shape
     row = jnp.arange(m)
 
-    def reflect(k: Any, carry: Any) -> Any:
+    def reflect(k: Array | int, carry: tuple[Array, ...]) -> Any:
         a, taus = carry
         alpha, below = a[k, k], jnp.where(row > k, a[:, k], 0)
         # Squares of the entries as they are may overflow, or be 0.
@@ -51,21 +52,21 @@ def _reflected(a: Any) -> tuple[Any, Any]:
     return jax.lax.fori_loop(0, min(m, n), reflect, (a, taus))
 
 
-def _square(x: Any) -> Any:
+def _square(x: Array) -> Any:
     return x.real**2 + x.imag**2 if jnp.iscomplexobj(x) else x * x
 
 
-def householder_product(a: Any, taus: Any, **_: Any) -> Any:
+def householder_product(a: Array, taus: Array, **_: object) -> Any:
     """The first columns of the product of the reflections."""
     refuse_large("householder_product", *a.shape[-2:])
     return of_batch(_product, a.ndim - 2)(a, taus)
 
 
-def _product(a: Any, taus: Any) -> Any:
+def _product(a: Array, taus: Array) -> Any:
     m, n = a.shape
     row, count = jnp.arange(m), len(taus)
 
-    def reflect(i: Any, q: Any) -> Any:
+    def reflect(i: Array | int, q: Array) -> Any:
         k = count - 1 - i
         v = jnp.where(row == k, 1, jnp.where(row > k, a[:, k], 0))
         return q - taus[k] * v[:, None] * (v.conj() @ q)

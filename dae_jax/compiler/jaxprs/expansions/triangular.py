@@ -4,26 +4,27 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from ...thresholds import THRESHOLDS
 from .factorisations import of_batch, refuse_large
 
 
 def triangular_solve(
-    a: Any,
-    b: Any,
+    a: Array,
+    b: Array,
     *,
     left_side: bool,
     lower: bool,
     transpose_a: bool,
     conjugate_a: bool,
     unit_diagonal: bool,
-    **_: Any,
+    **_: object,
 ) -> Any:
     """x with op(a) x = b, or x op(a) = b; the other half of a is not looked at."""
     refuse_large("triangular_solve", a.shape[-1])
 
-    def solved(a: Any, b: Any) -> Any:
+    def solved(a: Array, b: Array) -> Any:
         a = a.conj() if conjugate_a else a
         # x a = b is aᵀ xᵀ = bᵀ.
         transposed = transpose_a == left_side
@@ -38,7 +39,7 @@ def triangular_solve(
     return of_batch(solved, a.ndim - 2)(a, b)
 
 
-def _written_out(a: Any, b: Any, unit_diagonal: bool) -> Any:
+def _written_out(a: Array, b: Array, unit_diagonal: bool) -> Any:
     found: list[Any] = []
     for i in range(len(a)):
         rest = b[i]
@@ -48,10 +49,10 @@ def _written_out(a: Any, b: Any, unit_diagonal: bool) -> Any:
     return jnp.stack(found) if found else b
 
 
-def _in_loop(a: Any, b: Any, unit_diagonal: bool) -> Any:
+def _in_loop(a: Array, b: Array, unit_diagonal: bool) -> Any:
     place = jnp.arange(len(a))
 
-    def row(i: Any, x: Any) -> Any:
+    def row(i: Array | int, x: Array) -> Any:
         # What is not known yet is 0, also where the other half of a is not finite.
         rest = b[i] - jnp.where(place < i, a[i], 0) @ x
         return x.at[i].set(rest if unit_diagonal else rest / a[i, i])

@@ -1,12 +1,15 @@
 """The rule of branches. With lanes a branch runs if any lane takes it, and a mask says which do."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from jax.extend.core import ClosedJaxpr
 
 from ...jaxprs.objects import is_number
 from ..arithmetic import compared
+from ..arrays import Operand
 from ..context import Context
 from ..dtypes import ALL, BOOL, INTEGERS
 from ..instructions import Value
@@ -26,11 +29,11 @@ class _Branch:
 
 
 @rule("cond", (INTEGERS | BOOL, ALL), cost=free, nested=True)
-def cond(context: Context, *args: Any, branches: Any, **_: Any) -> list[Any]:
+def cond(context: Context, *args: Operand, branches: Sequence[ClosedJaxpr], **_: object) -> list[Any]:
     """The branch of a number, known or found at run time."""
     code, memory = context.code, context.memory
     which, *operands = map(memory.materialised, args)
-    index = memory.entries(which)[()]
+    index = memory.number(which)
     if is_number(index):
         return context.run(branches[min(max(int(index), 0), len(branches) - 1)], operands)
     taken = [_taken(context, index, k, len(branches) - 1) for k in range(len(branches))]
@@ -51,7 +54,7 @@ def cond(context: Context, *args: Any, branches: Any, **_: Any) -> list[Any]:
     return [out.value() for out in outs]
 
 
-def _taken(context: Context, index: Any, k: int, last: int) -> Value:
+def _taken(context: Context, index: Value, k: int, last: int) -> Value:
     """Which lanes take a branch."""
     code, dtype = context.code, context.dtypes[0]
     if dtype.kind == "b":
@@ -61,7 +64,7 @@ def _taken(context: Context, index: Any, k: int, last: int) -> Value:
     return code.op("and", "i1", code.mask, here) if code.mask is not None and here.lanes else here
 
 
-def _written(context: Context, branch: Any, operands: list[Any], taken: Value) -> _Branch:
+def _written(context: Context, branch: ClosedJaxpr, operands: list[Operand], taken: Value) -> _Branch:
     code, mask = context.code, context.code.mask
     code.lines, start = [], code.name()
     code.label(start)

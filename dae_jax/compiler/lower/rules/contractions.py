@@ -9,26 +9,35 @@ import numpy as np
 
 from ...jaxprs.objects import objects
 from ...thresholds import THRESHOLDS
+from ...types import Equation
 from ..arithmetic import combined, convert, total
-from ..arrays import View
+from ..arrays import Operand, View
 from ..context import Context
 from ..dtypes import NUMBERS
+from ..instructions import Index
 from ..registry import rule
 from .reductions import folded, in_pairs
 
 
-def _cost(eqn: Any) -> int:
+def _cost(eqn: Equation) -> int:
     (contracted, _), _ = eqn.params["dimension_numbers"]
     return 2 * eqn.outvars[0].aval.size * math.prod(eqn.invars[0].aval.shape[d] for d in contracted)
 
 
+# (contracted axes, batch axes) of both operands.
+DotNumbers = tuple[tuple[Sequence[int], Sequence[int]], tuple[Sequence[int], Sequence[int]]]
+
+
 @rule("dot_general", NUMBERS, cost=_cost)
-def dot_general(context: Context, a: Any, b: Any, *, dimension_numbers: Any, **_: Any) -> Any:
+def dot_general(context: Context, a: Operand, b: Operand, *, dimension_numbers: DotNumbers, **_: object) -> Any:
     """A product of matrices, summed over the contracted indices in turn."""
     if context.large:
         return _in_memory(context, context.view(a, 0), context.view(b, 1), dimension_numbers)
     (of_a, of_b), (batch_a, batch_b) = dimension_numbers
-    a, b = _matrices(_converted(context, a, 0), batch_a, of_a), _matrices(_converted(context, b, 1), batch_b, of_b)
+    a, b = (
+        _matrices(_converted(context, context.entries(a), 0), batch_a, of_a),
+        _matrices(_converted(context, context.entries(b), 1), batch_b, of_b),
+    )
     product = functools.partial(combined, context.code, "mul", context.to)
     plus = functools.partial(total, context.code, context.to)
     zero = np.zeros((), context.to)[()]
@@ -52,7 +61,7 @@ def _matrices(x: np.ndarray, batch: Sequence[int], contract: Sequence[int]) -> n
     return np.transpose(x, (*batch, *free, *contract)).reshape(count)
 
 
-def _in_memory(context: Context, a: View, b: View, dimension_numbers: Any) -> View:
+def _in_memory(context: Context, a: View, b: View, dimension_numbers: DotNumbers) -> View:
     dtype, zero = context.to, context.to.type(0)
     extents = [a.shape[d] for d in dimension_numbers[0][0]]
     term = _term(context, a, b, dimension_numbers)
@@ -64,7 +73,9 @@ def _in_memory(context: Context, a: View, b: View, dimension_numbers: Any) -> Vi
     return context.memory.made(dtype, context.out.shape, entry)
 
 
-def _term(context: Context, a: View, b: View, dimension_numbers: Any) -> Callable[[Sequence[Any], Sequence[Any]], Any]:
+def _term(
+    context: Context, a: View, b: View, dimension_numbers: DotNumbers
+) -> Callable[[Sequence[Any], Sequence[Any]], Any]:
     """The product of two entries, by the index of the result and the contracted one."""
     (of_a, of_b), (batch_a, batch_b) = dimension_numbers
     free_a = [d for d in range(a.ndim) if d not in (*of_a, *batch_a)]
@@ -76,7 +87,7 @@ def _term(context: Context, a: View, b: View, dimension_numbers: Any) -> Callabl
         entry = context.memory.entry(x, [found[d] for d in range(x.ndim)])
         return convert(context.code, entry, x.dtype, context.to)
 
-    def term(index: Sequence[Any], inner: Sequence[Any]) -> Any:
+    def term(index: Sequence[Index], inner: Sequence[Index]) -> Any:
         batch, rows, columns = index[:n], index[n : n + m], index[n + m :]
         left = number(a, ((batch_a, batch), (free_a, rows), (of_a, inner)))
         return combined(

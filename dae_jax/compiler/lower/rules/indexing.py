@@ -8,32 +8,33 @@ import numpy as np
 from ...jaxprs import movement
 from ...jaxprs.gathers import gathered, windows
 from ...jaxprs.objects import are_known, as_indices, objects
+from ...types import Params
 from ..access import load, store
 from ..arithmetic import combined, total
-from ..arrays import Fused, View, shared
+from ..arrays import Fused, Operand, View, shared
 from ..blocks import for_each
 from ..context import Context
 from ..dtypes import ALL, BOOL, INTEGERS, NUMBERS, REALS
 from ..indices import indices_of, offsets_of, window_start
-from ..instructions import Value
+from ..instructions import Index, Number, Value
 from ..registry import rule
 
 
 @rule("dynamic_slice", (ALL, INTEGERS), by_memory=True)
-def dynamic_slice(context: Context, x: Any, *starts: Any, slice_sizes: Sequence[int]) -> Any:
+def dynamic_slice(context: Context, x: Operand, *starts: Operand, slice_sizes: Sequence[int]) -> Any:
     """A window: in memory a view."""
-    if not context.large and all(map(are_known, starts)):
-        return movement.dynamic_slice(context.eqn, x, *starts)
+    if not context.large and all(are_known(context.entries(start)) for start in starts):
+        return movement.dynamic_slice(context.eqn, *map(context.entries, (x, *starts)))
     x = context.view(x)
     offset = context.memory.at(x, window_start(context, starts, 1, x.shape, slice_sizes))
     return View(x.dtype, tuple(context.out.shape), x.buffer, x.strides, offset)
 
 
 @rule("dynamic_update_slice", (ALL, ALL, INTEGERS), by_memory=True)
-def dynamic_update_slice(context: Context, x: Any, update: Any, *starts: Any) -> Any:
+def dynamic_update_slice(context: Context, x: Operand, update: Operand, *starts: Operand) -> Any:
     """An array with a window replaced."""
-    if not context.large and all(map(are_known, starts)):
-        return movement.dynamic_update_slice(context.eqn, x, update, *starts)
+    if not context.large and all(are_known(context.entries(start)) for start in starts):
+        return movement.dynamic_update_slice(context.eqn, *map(context.entries, (x, update, *starts)))
     out, update, *places = _owned(context, x, update, *starts)
     first = window_start(context, places, 2, out.shape, update.shape)
     to = View(out.dtype, update.shape, out.buffer, out.strides, context.memory.at(out, first))
@@ -41,39 +42,39 @@ def dynamic_update_slice(context: Context, x: Any, update: Any, *starts: Any) ->
     return out
 
 
-def _owned(context: Context, x: Any, *others: Any) -> list[Any]:
+def _owned(context: Context, x: Operand, *others: Operand) -> list[Any]:
     """An array that is updated in place where nothing else reads it, and what it is updated with, which may be a piece of it."""
     apart = [context.memory.copied(y, y.dtype) if shared(x, y) else y for y in others]
     return [context.memory.own(x, context.dtypes[0]), *apart]
 
 
-def _replaced(_: Context, __: Any, update: Any) -> Any:
+def _replaced(_: Context, __: Number, update: Number) -> Any:
     return update
 
 
-def _added(context: Context, before: Any, update: Any) -> Any:
+def _added(context: Context, before: Number, update: Number) -> Any:
     return total(context.code, context.to, before, update)
 
 
-def _combined(context: Context, before: Any, update: Any) -> Any:
+def _combined(context: Context, before: Number, update: Number) -> Any:
     return combined(context.code, context.name.removeprefix("scatter-"), context.to, before, update)
 
 
 @rule("scatter", (ALL, INTEGERS, ALL), by_memory=True)
-def scatter(context: Context, x: Any, indices: Any, update: Any, **_: Any) -> Any:
+def scatter(context: Context, x: Operand, indices: Operand, update: Operand, **_: object) -> Any:
     """An array with entries replaced."""
     return _scattered(context, x, indices, update, _replaced)
 
 
 @rule("scatter-add", (NUMBERS | BOOL, INTEGERS, NUMBERS | BOOL), by_memory=True)
-def scatter_add(context: Context, x: Any, indices: Any, update: Any, **_: Any) -> Any:
+def scatter_add(context: Context, x: Operand, indices: Operand, update: Operand, **_: object) -> Any:
     """An array with something added to entries."""
     return _scattered(context, x, indices, update, _added)
 
 
 @rule("scatter-sub scatter-mul", (NUMBERS, INTEGERS, NUMBERS), by_memory=True)
 @rule("scatter-min scatter-max", (REALS | BOOL, INTEGERS, REALS | BOOL), by_memory=True)
-def scatter_combined(context: Context, x: Any, indices: Any, update: Any, **_: Any) -> Any:
+def scatter_combined(context: Context, x: Operand, indices: Operand, update: Operand, **_: object) -> Any:
     """An array with entries less something, times something, or replaced by what is smaller or larger."""
     return _scattered(context, x, indices, update, _combined)
 
@@ -81,16 +82,17 @@ def scatter_combined(context: Context, x: Any, indices: Any, update: Any, **_: A
 Combine = Callable[[Context, Any, Any], Any]
 
 
-def _scattered(context: Context, x: Any, indices: Any, update: Any, combine: Combine) -> Any:
+def _scattered(context: Context, x: Operand, indices: Operand, update: Operand, combine: Combine) -> Any:
     code, memory, p = context.code, context.memory, context.eqn.params
-    if not context.large and are_known(indices):
-        return movement.scatter(context.eqn, x, indices, update, lambda a, b: combine(context, a, b))
+    if not context.large and are_known(context.entries(indices)):
+        entries = [context.entries(y) for y in (x, indices, update)]
+        return movement.scatter(context.eqn, entries[0], entries[1], entries[2], lambda a, b: combine(context, a, b))
     out, indices, update = _owned(context, x, indices, update)
     numbers, sizes = windows(out.shape, update.shape, p["dimension_numbers"])
     read = indices_of(context, indices, not isinstance(update, np.ndarray) and update.size > memory.few)
     place = offsets_of(context, out, read, numbers, sizes, p["mode"])
 
-    def put(index: list[Any], x: Any) -> None:
+    def put(index: list[Index], x: Number) -> None:
         at, inside = place(index)
         if combine is not _replaced:
             x = combine(context, load(code, out.buffer, at), x)
@@ -104,20 +106,20 @@ def _scattered(context: Context, x: Any, indices: Any, update: Any, combine: Com
 
 
 @rule("gather", (ALL, INTEGERS), by_memory=True)
-def gather(context: Context, x: Any, indices: Any, **p: Any) -> Any:
+def gather(context: Context, x: Operand, indices: Operand, **p: Any) -> Any:
     """Entries at indices; what is outside of the array is the fill value."""
     code, memory, out = context.code, context.memory, context.out
     known = isinstance(indices, np.ndarray) and are_known(indices)
     if not context.large and known:
-        return movement.gather(context.eqn, x, indices)
+        return movement.gather(context.eqn, context.entries(x), context.entries(indices))
     x, fill = context.view(x), movement.fill_of(p["fill_value"], context.to)
     if known:
-        return _at_known_places(context, x, as_indices(indices), p, fill)
+        return _at_known_places(context, x, as_indices(context.entries(indices)), p, fill)
     looped = out.size > memory.few
     read = indices_of(context, indices, looped)
     place = offsets_of(context, x, read, p["dimension_numbers"], p["slice_sizes"], p["mode"])
 
-    def entry(index: Sequence[Any]) -> Any:
+    def entry(index: Sequence[Index]) -> Any:
         at, inside = place(index)
         number = load(code, x.buffer, at)
         return number if inside is None else code.select(inside, number, fill, x.buffer.kind)
@@ -127,7 +129,7 @@ def gather(context: Context, x: Any, indices: Any, **p: Any) -> Any:
     return objects([entry(list(i)) for i in np.ndindex(out.shape)], out.shape)
 
 
-def _at_known_places(context: Context, x: View, indices: np.ndarray, p: Any, fill: Any) -> View | Fused:
+def _at_known_places(context: Context, x: View, indices: np.ndarray, p: Params, fill: Number) -> View | Fused:
     """A view where they are evenly spaced, else by a table."""
     code, shape = context.code, tuple(context.out.shape)
     order = gathered(np.arange(x.size).reshape(x.shape), indices, p["dimension_numbers"], p["slice_sizes"], p["mode"])
@@ -138,9 +140,9 @@ def _at_known_places(context: Context, x: View, indices: np.ndarray, p: Any, fil
         return View(x.dtype, shape, x.buffer, strides, code.plus(x.offset, int(places[(0,) * places.ndim])))
     table = context.memory.constant_view(np.where(order >= 0, places, -1))
 
-    def read(index: Sequence[Any]) -> Any:
+    def read(index: Sequence[Index]) -> Any:
         if not any(isinstance(i, Value) for i in index):
-            k = tuple(index)
+            k: Any = tuple(index)
             return load(code, x.buffer, code.plus(x.offset, int(places[k]))) if order[k] >= 0 else fill
         place = context.memory.entry(table, index)
         if inside:

@@ -5,20 +5,20 @@ from typing import Any
 from ..context import Context
 from ..dtypes import BOOL, BYTES, INTEGERS, kind_of
 from ..entrywise import entrywise
-from ..instructions import Value
+from ..instructions import Number, Value
 
 
 _SHIFTS = {"shift_left": "shl", "shift_right_logical": "lshr"}
 
 
 @entrywise("not", INTEGERS | BOOL)
-def inverted(context: Context, x: Any, **_: Any) -> Value:
+def inverted(context: Context, x: Number, **_: object) -> Value:
     """All bits the other way."""
     return context.code.op("xor", kind_of(context.dtype), x, -1)
 
 
 @entrywise("shift_left shift_right_logical", INTEGERS)
-def shift(context: Context, x: Any, by: Any, **_: Any) -> Any:
+def shift(context: Context, x: Number, by: Number, **_: object) -> Any:
     """By the width and more, and by less than none, all bits are shifted out; a shift of LLVM's is undefined there."""
     code, kind = context.code, kind_of(context.dtype)
     last = 8 * BYTES[kind] - 1
@@ -27,20 +27,20 @@ def shift(context: Context, x: Any, by: Any, **_: Any) -> Any:
 
 
 @entrywise("shift_right_arithmetic", INTEGERS)
-def shift_right_arithmetic(context: Context, x: Any, by: Any, **_: Any) -> Value:
+def shift_right_arithmetic(context: Context, x: Number, by: Number, **_: object) -> Value:
     """The sign is shifted in, by the width and more everywhere."""
     code, kind = context.code, kind_of(context.dtype)
     return code.op("ashr", kind, x, code.intrinsic("umin", kind, by, 8 * BYTES[kind] - 1))
 
 
 @entrywise("population_count", INTEGERS)
-def bit_count(context: Context, x: Any, **_: Any) -> Value:
+def bit_count(context: Context, x: Number, **_: object) -> Value:
     """How many bits are 1."""
     return context.code.intrinsic("ctpop", kind_of(context.dtype), x)
 
 
 @entrywise("clz", INTEGERS)
-def leading_zeros(context: Context, x: Any, **_: Any) -> Value:
+def leading_zeros(context: Context, x: Number, **_: object) -> Value:
     """How many of the first bits are 0."""
     code, kind = context.code, kind_of(context.dtype)
     x = code.copy(x, kind)

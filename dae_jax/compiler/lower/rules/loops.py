@@ -4,10 +4,12 @@ import contextlib
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import numpy as np
 from jax.extend.core import ClosedJaxpr
 
 from ...jaxprs.objects import objects
 from ...thresholds import THRESHOLDS
+from ..arrays import Operand, View
 from ..blocks import loop
 from ..carry import Carry
 from ..context import Context
@@ -20,7 +22,7 @@ from ..uniformity import varying_in_loop, varying_in_scan
 
 
 @contextlib.contextmanager
-def _retained(xs: Sequence[Any]) -> Iterator[None]:
+def _retained(xs: Sequence[Operand]) -> Iterator[None]:
     """Something reads these arrays later."""
     for x in xs:
         retain(x, 1)
@@ -29,12 +31,12 @@ def _retained(xs: Sequence[Any]) -> Iterator[None]:
         retain(x, -1)
 
 
-def _lanes(xs: Sequence[Any]) -> list[bool]:
+def _lanes(xs: Sequence[Operand]) -> list[bool]:
     return list(map(has_lanes, xs))
 
 
 @rule("while", ALL, cost=free, nested=True)
-def while_(context: Context, *args: Any, **p: Any) -> list[Any]:
+def while_(context: Context, *args: Operand, **p: Any) -> list[Any]:
     """Turns for as long as a condition holds; with lanes, in any of them."""
     code, n, m = context.code, p["cond_nconsts"], p["body_nconsts"]
     operands = list(map(context.memory.materialised, args))
@@ -52,7 +54,7 @@ def while_(context: Context, *args: Any, **p: Any) -> list[Any]:
         with code.scope():
             with _retained(carry.values):
                 (goes_on,) = context.run(p["cond_jaxpr"], [*of_cond, *carry.values])
-            more = code.copy(context.memory.entries(goes_on)[()], "i1")
+            more = code.copy(context.memory.number(goes_on), "i1")
             each = any(own) and more.lanes
             if each:
                 code.mask = code.op("and", "i1", more, Value(f"%{active}", "i1", True))
@@ -72,7 +74,9 @@ def while_(context: Context, *args: Any, **p: Any) -> list[Any]:
 
 
 @rule("scan", ALL, cost=free, nested=True)
-def scan(context: Context, *args: Any, num_consts: int, num_carry: int, jaxpr: Any, **_: Any) -> list[Any]:
+def scan(
+    context: Context, *args: Operand, num_consts: int, num_carry: int, jaxpr: ClosedJaxpr, **_: object
+) -> list[Any]:
     """A known number of turns, written out where they are few."""
     memory, start = context.memory, num_consts + num_carry
     operands = list(map(memory.materialised, args))
@@ -85,7 +89,9 @@ def scan(context: Context, *args: Any, num_consts: int, num_carry: int, jaxpr: A
         return _scanned(context, jaxpr, consts, first, rows)
 
 
-def _scanned(context: Context, inner: ClosedJaxpr, consts: list[Any], first: list[Any], rows: list[Any]) -> list[Any]:
+def _scanned(
+    context: Context, inner: ClosedJaxpr, consts: list[Operand], first: list[Operand], rows: Sequence[View]
+) -> list[Any]:
     code, memory, p = context.code, context.memory, context.eqn.params
     n, m = p["num_consts"], p["num_carry"]
     ys = [memory.new(a.dtype, a.shape) for a in context.outs[m:]]
@@ -103,7 +109,9 @@ def _scanned(context: Context, inner: ClosedJaxpr, consts: list[Any], first: lis
     return [*carry.values, *ys]
 
 
-def _written_out(context: Context, inner: ClosedJaxpr, consts: list[Any], carry: list[Any], xs: list[Any]) -> list[Any]:
+def _written_out(
+    context: Context, inner: ClosedJaxpr, consts: list[Operand], carry: list[Operand], xs: list[np.ndarray]
+) -> list[Any]:
     length, m = context.eqn.params["length"], len(carry)
     rows: list[Any] = [None] * length
     for i in reversed(range(length)) if context.eqn.params["reverse"] else range(length):

@@ -9,9 +9,10 @@ import numpy as np
 
 from ...jaxprs.movement import MOVEMENTS
 from ..arithmetic import convert
-from ..arrays import Fused, View, row_major
+from ..arrays import Fused, Operand, View, row_major
 from ..context import Context
 from ..dtypes import ALL, REALS
+from ..instructions import Index
 from ..registry import free, rule
 
 
@@ -22,7 +23,7 @@ def movement(
 
     def enter(in_memory: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(in_memory)
-        def lower(context: Context, *args: Any, **params: Any) -> Any:
+        def lower(context: Context, *args: Operand, **params: object) -> Any:
             move = functools.partial(in_memory, **params) if context.large else _in_registers
             return move(context, *args)
 
@@ -31,12 +32,12 @@ def movement(
     return enter
 
 
-def _in_registers(context: Context, *args: np.ndarray) -> Any:
-    return MOVEMENTS[context.name](context.eqn, *args)
+def _in_registers(context: Context, *args: Operand) -> Any:
+    return MOVEMENTS[context.name](context.eqn, *map(context.entries, args))
 
 
 @movement("reshape squeeze expand_dims")
-def reshape(context: Context, x: Any, **_: Any) -> Any:
+def reshape(context: Context, x: Operand, **_: object) -> Any:
     """The same entries in order, with other indices."""
     x, shape = context.array(x), tuple(context.out.shape)
     found = _in_order(context, x, shape)
@@ -48,7 +49,9 @@ def reshape(context: Context, x: Any, **_: Any) -> Any:
 
 
 @movement("broadcast_in_dim")
-def broadcast_in_dim(context: Context, x: Any, *, shape: Any, broadcast_dimensions: Sequence[int], **_: Any) -> Any:
+def broadcast_in_dim(
+    context: Context, x: Operand, *, shape: Sequence[int], broadcast_dimensions: Sequence[int], **_: object
+) -> Any:
     """Entries at several indices."""
     x, shape = context.array(x), tuple(shape)
     if list(broadcast_dimensions) == sorted(broadcast_dimensions) and x.size == math.prod(shape):
@@ -61,7 +64,7 @@ def broadcast_in_dim(context: Context, x: Any, *, shape: Any, broadcast_dimensio
 
 
 @movement("transpose")
-def transpose(context: Context, x: Any, *, permutation: Sequence[int]) -> Any:
+def transpose(context: Context, x: Operand, *, permutation: Sequence[int]) -> Any:
     """Axes in another order."""
     x, shape = context.array(x), tuple(context.out.shape)
     if isinstance(x, Fused):
@@ -71,7 +74,7 @@ def transpose(context: Context, x: Any, *, permutation: Sequence[int]) -> Any:
 
 
 @movement("rev")
-def rev(context: Context, x: Any, *, dimensions: Sequence[int]) -> Any:
+def rev(context: Context, x: Operand, *, dimensions: Sequence[int]) -> Any:
     """Axes from their end."""
     x = _viewed(context, context.array(x))
     offset = x.offset
@@ -82,7 +85,7 @@ def rev(context: Context, x: Any, *, dimensions: Sequence[int]) -> Any:
 
 
 @movement("slice")
-def slice_(context: Context, x: Any, *, start_indices: Sequence[int], strides: Any, **_: Any) -> Any:
+def slice_(context: Context, x: Operand, *, start_indices: Sequence[int], strides: Sequence[int], **_: object) -> Any:
     """A part of the array."""
     code, x, shape = context.code, context.array(x), tuple(context.out.shape)
     starts, steps = list(map(int, start_indices)), list(map(int, strides or (1,) * x.ndim))
@@ -96,19 +99,19 @@ def slice_(context: Context, x: Any, *, start_indices: Sequence[int], strides: A
 
 
 @movement("tile")
-def tile(context: Context, x: Any, **_: Any) -> Any:
+def tile(context: Context, x: Operand, **_: object) -> Any:
     """The array repeated along its axes."""
     x = _viewed(context, context.array(x))
     read = lambda index: context.memory.entry(x, [_modulo(context, i, n) for i, n in zip(index, x.shape, strict=True)])
     return Fused(x.dtype, tuple(context.out.shape), read, x.buffers)
 
 
-def _modulo(context: Context, i: Any, n: int) -> Any:
+def _modulo(context: Context, i: Index, n: int) -> Any:
     return i % n if isinstance(i, int) else context.code.op("urem", "i64", i, n)
 
 
 @movement("split unstack")
-def split(context: Context, x: Any, *, axis: int, **_: Any) -> Any:
+def split(context: Context, x: Operand, *, axis: int, **_: object) -> Any:
     """Pieces of an array along an axis, or its entries there."""
     x, start, out = context.array(x), 0, []
     entries = context.name == "unstack"
@@ -126,18 +129,18 @@ def split(context: Context, x: Any, *, axis: int, **_: Any) -> Any:
 
 
 @movement("concatenate")
-def concatenate(context: Context, *args: Any, dimension: int) -> Any:
+def concatenate(context: Context, *args: Operand, dimension: int) -> Any:
     """Arrays one after another along an axis."""
     return _joined(context, args, dimension, False)
 
 
 @movement("stack")
-def stack(context: Context, *args: Any, axis: int, **_: Any) -> Any:
+def stack(context: Context, *args: Operand, axis: int, **_: object) -> Any:
     """Arrays one after another along a new axis."""
     return _joined(context, args, axis, True)
 
 
-def _joined(context: Context, args: Sequence[Any], axis: int, along_new: bool) -> View:
+def _joined(context: Context, args: Sequence[Operand], axis: int, along_new: bool) -> View:
     memory = context.memory
     args = [context.array(x, k) if x.ndim else x for k, x in enumerate(args)]
     result, start = memory.new(context.to, context.out.shape), 0
@@ -150,7 +153,7 @@ def _joined(context: Context, args: Sequence[Any], axis: int, along_new: bool) -
 
 
 @movement("pad")
-def pad(context: Context, x: Any, fill: Any, *, padding_config: Any) -> Any:
+def pad(context: Context, x: Operand, fill: Operand, *, padding_config: Sequence[tuple[int, int, int]]) -> Any:
     """Something else around the entries and between them; of a negative width that many entries are left out."""
     memory, x = context.memory, context.array(x) if x.ndim else x
     config = [tuple(map(int, c)) for c in padding_config]
@@ -169,7 +172,7 @@ def pad(context: Context, x: Any, fill: Any, *, padding_config: Any) -> Any:
 
 
 @movement("iota", REALS, fuses=True)
-def iota(context: Context, *, dimension: int, **_: Any) -> Any:
+def iota(context: Context, *, dimension: int, **_: object) -> Any:
     """Indices along an axis."""
     code, to, of = context.code, context.to, np.dtype("int64")
     number = lambda i: convert(code, np.int64(i) if isinstance(i, int) else i, of, to)
@@ -179,7 +182,7 @@ def iota(context: Context, *, dimension: int, **_: Any) -> Any:
 def _in_order(context: Context, x: View | Fused, shape: tuple[int, ...]) -> Fused | None:
     """What is yet to be computed read in another shape, where its entries can be read by their place."""
     flat = context.memory.flat(x) if isinstance(x, Fused) else None
-    if not flat or not shape:
+    if not isinstance(x, Fused) or not flat or not shape:
         return None
     code = context.code
     place = lambda index: functools.reduce(code.plus, map(code.times, index, row_major(shape)))

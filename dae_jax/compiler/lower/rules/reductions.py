@@ -9,14 +9,15 @@ import numpy as np
 
 from ...jaxprs.objects import columns, objects
 from ...thresholds import THRESHOLDS
+from ...types import Equation
 from .. import complex_arithmetic
 from ..access import load, store
 from ..arithmetic import applied, better, combined, convert, identity
-from ..arrays import Fused, View
+from ..arrays import Fused, Operand, View
 from ..blocks import accumulated, for_each
 from ..context import Context
 from ..dtypes import BOOL, FLOATS, INTEGERS, NUMBERS, REALS, kind_of, parts_of
-from ..instructions import Complex, parts
+from ..instructions import Complex, Index, Number, parts
 from ..registry import rule
 
 
@@ -27,12 +28,12 @@ _FOLDS = {
 }  # fmt: skip
 
 
-def operand_size(eqn: Any) -> int:
+def operand_size(eqn: Equation) -> int:
     """An instruction for each entry of the operand."""
     return eqn.invars[0].aval.size
 
 
-def in_pairs(combine: Callable[[Any, Any], Any], terms: list[Any]) -> Any:
+def in_pairs(combine: Callable[[Number, Number], Number], terms: list[Number]) -> Any:
     """All terms combined, two by two: none waits for the sum of all before it, and less is rounded off."""
     while len(terms) > 1:
         rest = terms[len(terms) // 2 * 2 :]
@@ -41,21 +42,21 @@ def in_pairs(combine: Callable[[Any, Any], Any], terms: list[Any]) -> Any:
 
 
 @rule("reduce_sum reduce_prod", NUMBERS | BOOL, cost=operand_size)
-def total(context: Context, x: Any, *, axes: Sequence[int], **_: Any) -> Any:
+def total(context: Context, x: Operand, *, axes: Sequence[int], **_: object) -> Any:
     """The sum or the product along axes."""
-    return _in_memory(context, x, axes) if context.large else _in_registers(context, x, axes)
+    return _in_memory(context, x, axes) if context.large else _in_registers(context, context.entries(x), axes)
 
 
 @rule("reduce_max reduce_min", REALS | BOOL, cost=operand_size)
-def extremum(context: Context, x: Any, *, axes: Sequence[int], **_: Any) -> Any:
+def extremum(context: Context, x: Operand, *, axes: Sequence[int], **_: object) -> Any:
     """The largest or the smallest along axes."""
-    return _in_memory(context, x, axes) if context.large else _in_registers(context, x, axes)
+    return _in_memory(context, x, axes) if context.large else _in_registers(context, context.entries(x), axes)
 
 
 @rule("reduce_and reduce_or reduce_xor", INTEGERS | BOOL, cost=operand_size)
-def bitwise(context: Context, x: Any, *, axes: Sequence[int], **_: Any) -> Any:
+def bitwise(context: Context, x: Operand, *, axes: Sequence[int], **_: object) -> Any:
     """Bit by bit along axes."""
-    return _in_memory(context, x, axes) if context.large else _in_registers(context, x, axes)
+    return _in_memory(context, x, axes) if context.large else _in_registers(context, context.entries(x), axes)
 
 
 def _combine(context: Context) -> Callable[[Any, Any], Any]:
@@ -68,14 +69,15 @@ def _in_registers(context: Context, x: np.ndarray, axes: Sequence[int]) -> np.nd
     return objects([in_pairs(combine, [*x[(slice(None), *i)], *first]) for i in np.ndindex(x.shape[1:])], x.shape[1:])
 
 
-def _in_memory(context: Context, x: Any, axes: Sequence[int]) -> Any:
+def _in_memory(context: Context, x: Operand, axes: Sequence[int]) -> Any:
     memory, out, name, dtype = context.memory, context.out, _FOLDS[context.name], context.to
     x = context.array(x) if x.ndim else x
+    buffers = () if isinstance(x, np.ndarray) else x.buffers
     kept = [d for d in range(x.ndim) if d not in axes]
     extents = [x.shape[d] for d in axes]
     first, flat = identity(name, dtype), memory.flat(x)
 
-    def entry(at: Sequence[Any], of: Sequence[Any]) -> Any:
+    def entry(at: Sequence[Index], of: Sequence[Index]) -> Any:
         index: list[Any] = [None] * x.ndim
         for d, i in (*zip(kept, at, strict=True), *zip(axes, of, strict=True)):
             index[d] = i
@@ -83,7 +85,7 @@ def _in_memory(context: Context, x: Any, axes: Sequence[int]) -> Any:
 
     if math.prod(extents) <= THRESHOLDS.carried:
         read = lambda at: in_pairs(_combine(context), [entry(at, of) for of in np.ndindex(*extents)] or [first])
-        return Fused(dtype, tuple(out.shape), read, x.buffers, depth=getattr(x, "depth", 0) + 1)
+        return Fused(dtype, tuple(out.shape), read, buffers, depth=getattr(x, "depth", 0) + 1)
     if not kept and flat:
         return objects([folded(context, name, [x.size], first, lambda i: flat(i[0]))], ())
     if not kept or max(kept) < max(axes):
@@ -92,12 +94,12 @@ def _in_memory(context: Context, x: Any, axes: Sequence[int]) -> Any:
     return _row_by_row(context, memory.view(x, dtype), kept, first)
 
 
-def _row_by_row(context: Context, x: View, kept: list[int], first: Any) -> View:
+def _row_by_row(context: Context, x: View, kept: list[int], first: Number) -> View:
     """What lies together is read together: all results at once, from row after row."""
     code, memory = context.code, context.memory
     result = memory.made(context.to, context.out.shape, lambda _: first)
 
-    def add(index: list[Any]) -> None:
+    def add(index: list[Index]) -> None:
         place = memory.at(result, [index[d] for d in kept])
         found = _combine(context)(load(code, result.buffer, place), memory.entry(x, index))
         store(code, result.buffer, place, found)
@@ -107,12 +109,14 @@ def _row_by_row(context: Context, x: View, kept: list[int], first: Any) -> View:
     return result
 
 
-def folded(context: Context, name: str, shape: Sequence[int], first: Any, entry: Callable[[list[Any]], Any]) -> Any:
+def folded(
+    context: Context, name: str, shape: Sequence[int], first: Number, entry: Callable[[list[Index]], Number]
+) -> Any:
     """Entries combined by a loop, in any order."""
     code, dtype = context.code, context.to
     kind, count = parts_of(dtype)
 
-    def step(found: list[Any], index: list[Any]) -> Sequence[Any]:
+    def step(found: list[Number], index: list[Index]) -> Sequence[Any]:
         if name == "add" and dtype.kind in "fc":
             terms = parts(entry(index)) if count == 2 else (entry(index),)
             return [code.op("fadd reassoc contract", kind, a, b) for a, b in zip(found, terms, strict=True)]
@@ -125,21 +129,33 @@ def folded(context: Context, name: str, shape: Sequence[int], first: Any, entry:
 
 
 @rule("cumsum cumprod", NUMBERS, cost=operand_size)
-def running_total(context: Context, x: Any, *, axis: int, reverse: bool) -> Any:
+def running_total(context: Context, x: Operand, *, axis: int, reverse: bool) -> Any:
     """The sum or the product of all entries up to here."""
-    return _running_in_memory(context, x, axis, reverse) if context.large else _running(context, x, axis, reverse)
+    return (
+        _running_in_memory(context, x, axis, reverse)
+        if context.large
+        else _running(context, context.entries(x), axis, reverse)
+    )
 
 
 @rule("cumlogsumexp", FLOATS, cost=operand_size)
-def running_log_of_sum(context: Context, x: Any, *, axis: int, reverse: bool) -> Any:
+def running_log_of_sum(context: Context, x: Operand, *, axis: int, reverse: bool) -> Any:
     """The logarithm of the sum of the exponentials of all entries up to here."""
-    return _running_in_memory(context, x, axis, reverse) if context.large else _running(context, x, axis, reverse)
+    return (
+        _running_in_memory(context, x, axis, reverse)
+        if context.large
+        else _running(context, context.entries(x), axis, reverse)
+    )
 
 
 @rule("cummax cummin", REALS | BOOL, cost=operand_size)
-def running_extremum(context: Context, x: Any, *, axis: int, reverse: bool) -> Any:
+def running_extremum(context: Context, x: Operand, *, axis: int, reverse: bool) -> Any:
     """The largest or the smallest of all entries up to here."""
-    return _running_in_memory(context, x, axis, reverse) if context.large else _running(context, x, axis, reverse)
+    return (
+        _running_in_memory(context, x, axis, reverse)
+        if context.large
+        else _running(context, context.entries(x), axis, reverse)
+    )
 
 
 def _running(context: Context, x: np.ndarray, axis: int, reverse: bool) -> np.ndarray:
@@ -151,13 +167,13 @@ def _running(context: Context, x: np.ndarray, axis: int, reverse: bool) -> np.nd
     return np.moveaxis(out[::-1] if reverse else out, 0, axis)
 
 
-def _running_in_memory(context: Context, x: Any, axis: int, reverse: bool) -> View:
+def _running_in_memory(context: Context, x: Operand, axis: int, reverse: bool) -> View:
     """In place, from the second entry on."""
     code, memory = context.code, context.memory
     out = memory.copied(context.array(x), context.to)
     turns = [n - (d == axis) for d, n in enumerate(out.shape)]
 
-    def add(index: list[Any]) -> None:
+    def add(index: list[Index]) -> None:
         i = index[axis]
         i = code.plus(out.shape[axis] - 2, code.times(i, -1)) if reverse else code.plus(i, 1)
         here, before = ([*index[:axis], k, *index[axis + 1 :]] for k in (i, code.plus(i, 1 if reverse else -1)))
@@ -170,9 +186,13 @@ def _running_in_memory(context: Context, x: Any, axis: int, reverse: bool) -> Vi
 
 
 @rule("argmax argmin", REALS | BOOL, cost=operand_size)
-def place_of_extremum(context: Context, x: Any, *, axes: Sequence[int], **_: Any) -> Any:
+def place_of_extremum(context: Context, x: Operand, *, axes: Sequence[int], **_: object) -> Any:
     """Where the first of the largest or the smallest is along an axis."""
-    return _place_in_memory(context, x, *axes) if context.large else _place_in_registers(context, x, *axes)
+    return (
+        _place_in_memory(context, x, *axes)
+        if context.large
+        else _place_in_registers(context, context.entries(x), *axes)
+    )
 
 
 def _place_in_registers(context: Context, x: np.ndarray, axis: int) -> np.ndarray:
@@ -185,15 +205,15 @@ def _place_in_registers(context: Context, x: np.ndarray, axis: int) -> np.ndarra
     return objects([place for _, place in found], moved.shape[1:])
 
 
-def _place_in_memory(context: Context, x: Any, axis: int) -> View | Fused:
+def _place_in_memory(context: Context, x: Operand, axis: int) -> View | Fused:
     code, memory, to = context.code, context.memory, context.to
     x = context.array(x)
     choose = functools.partial(better, code, context.name, context.dtype, to)
 
-    def read(at: Sequence[Any]) -> Any:
+    def read(at: Sequence[Index]) -> Any:
         entry = lambda i: memory.entry(x, [*at[:axis], i, *at[axis:]])
 
-        def step(found: list[Any], index: list[Any]) -> Sequence[Any]:
+        def step(found: list[Number], index: list[Index]) -> Sequence[Any]:
             place = convert(code, index[0], np.dtype("int64"), to)
             return choose(found, (entry(index[0]), place))
 

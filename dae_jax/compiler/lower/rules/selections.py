@@ -7,10 +7,11 @@ from ..arithmetic import compared
 from ..context import Context
 from ..dtypes import ALL, BOOL, INTEGERS, kind_of, part
 from ..entrywise import entrywise
+from ..instructions import Number
 
 
 @entrywise("select_n", (BOOL | INTEGERS, ALL), moves=True)
-def select_n(context: Context, which: Any, first: Any, *others: Any, **_: Any) -> Any:
+def select_n(context: Context, which: Number, first: Number, *others: Number, **_: object) -> Any:
     """The case of the number that `which` is."""
     code, dtype, kind = context.code, context.dtypes[0], kind_of(part(context.to))
     if is_number(which):
