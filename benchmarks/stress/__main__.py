@@ -2,14 +2,13 @@
 
 import argparse
 import sys
-import time
 from pathlib import Path
 
 from dae_jax.app import options
 
 from . import growth, page
 from .cases import METHODS
-from .families import FAMILIES, SCENE, cases_of
+from .families import FAMILIES, SCENE, cells_of
 from .record import Record
 from .runner import LIMIT, run
 
@@ -50,19 +49,17 @@ def main(argv=None):
     families = _names(parser, "family", arguments.stressors, FAMILIES, QUICK_FAMILIES if arguments.quick else FAMILIES)
     families = [SCENE + scene for scene in arguments.scenes] or families
     options.writable(parser, arguments.out)
-    record, count, begin = Record.read(arguments.out), 0, time.perf_counter()
+    record, count = Record.read(arguments.out), 0
     try:
         for family in families:
-            cases = cases_of(family, arguments.quick)
-            todo = [(case.name, name) for name in methods for case in cases if case.applies(name)]
-            for cell, series in run(family, todo, arguments.quick, arguments.limit):
+            for cell, series in run(
+                family, cells_of(family, methods, arguments.quick), arguments.quick, arguments.limit
+            ):
                 print(_line(cell), flush=True)
                 count += 1
                 record.add(cell, growth.laws(series) if series else None)
             if hasattr(FAMILIES.get(family), "figures"):
                 record.figures |= FAMILIES[family].figures(arguments.out, arguments.quick, record.of(family))
-            record.seconds[family] = time.perf_counter() - begin
-            begin = time.perf_counter()
             record.write(arguments.out)
             page.write(record, arguments.out)
     except KeyboardInterrupt:

@@ -5,7 +5,7 @@ from collections import Counter
 
 from . import figure, growth
 from .cases import METHODS, ON_THE_CONSTRAINTS, SYMMETRIC
-from .families import FAMILIES
+from .families import FAMILIES, cells_of
 from .judge import WRONG
 from .record import TABLE
 
@@ -35,9 +35,11 @@ scipy at 1e-13. Errors are relative to the size of the motion, and drift is |g| 
 
 def write(record, folder):
     """The page and the map."""
-    cells, minutes = record.cells, sum(record.seconds.values()) / 60
+    cells = record.cells
+    minutes = sum(cell.seconds for cell in cells) / 60
     text = [
         HEAD.format(count=len(cells), minutes=minutes),
+        _not_measured(record),
         _counted(cells),
         _statements(record),
         growth.table(record.growth),
@@ -52,6 +54,19 @@ def counts(cells):
     """How many cells of each verdict."""
     found = Counter(cell.verdict for cell in cells)
     return ", ".join(f"{found[verdict]} {verdict}" for verdict in VERDICTS)
+
+
+def _not_measured(record):
+    """Families of which cells are missing, and how many; empty where there are none."""
+    lacking = []
+    for family in FAMILIES:
+        cells = cells_of(family, METHODS, False)
+        missing = len(set(cells) - {(cell.stressor, cell.method) for cell in record.of(family)})
+        if missing:
+            lacking.append(
+                f"{family}, all {missing}" if missing == len(cells) else f"{family}, {missing} of {len(cells)}"
+            )
+    return f"**Not measured** yet, and not in what follows: the cells of {'; '.join(lacking)}.\n" if lacking else ""
 
 
 def _counted(cells):

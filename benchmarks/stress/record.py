@@ -13,12 +13,11 @@ TABLE, NOTES = "stress.csv", "stress.json"
 
 @dataclasses.dataclass
 class Record:
-    """The cells; of some the laws of growth {stressor: {method: law}}; figures {file: what it shows}; seconds by family."""
+    """The cells; of some the laws of growth {stressor: {method: law}}; figures {file: what it shows}."""
 
     cells: list[Cell]
     growth: dict[str, dict[str, dict[str, float]]] = dataclasses.field(default_factory=dict)
     figures: dict[str, str] = dataclasses.field(default_factory=dict)
-    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
 
     @classmethod
     def read(cls, folder):
@@ -47,5 +46,5 @@ class Record:
             table = csv.DictWriter(file, [field.name for field in dataclasses.fields(Cell)])
             table.writeheader()
             table.writerows(map(dataclasses.asdict, self.cells))
-        notes = {"growth": self.growth, "figures": self.figures, "seconds": self.seconds}
+        notes = {"growth": self.growth, "figures": self.figures}
         (folder / NOTES).write_text(json.dumps(notes, indent=1, ensure_ascii=False) + "\n")

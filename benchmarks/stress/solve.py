@@ -50,6 +50,8 @@ def solved(case: Case, name: str) -> Outcome:
             np.asarray(x).item() for x in (sol.result._value, sol.stats["num_steps"], sol.stats["end_time"])
         )
     except (RuntimeError, TypeError, ValueError) as refusal:
+        if "RESOURCE_EXHAUSTED" in str(refusal):
+            raise MemoryError from refusal
         return Outcome("refused", " ".join(str(refusal).split()), seconds=time.perf_counter() - begin)
     taken = {"steps": steps, "end": end, "seconds": time.perf_counter() - begin}
     if code not in OKAY:

@@ -4,10 +4,15 @@ import argparse
 import dataclasses
 import json
 import os
+import resource
 import signal
 import sys
 
 import numpy as np
+
+
+# What a cell says that needs more memory than there is.
+FULL = "out of memory"
 
 
 def main():
@@ -18,7 +23,12 @@ def main():
     parser.add_argument(
         "--limit", type=float, required=True, help="seconds of processor time for a cell; then the process ends"
     )
+    parser.add_argument("--memory", type=float, required=True, help="GiB; whoever asks for more gets an error")
     arguments = parser.parse_args()
+    most = int(arguments.memory * 2**30)
+    resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+    # No dump of that size.
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     # What a library prints must not end up between the lines.
     out, sys.stdout = sys.stdout, sys.stderr

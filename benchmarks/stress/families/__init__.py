@@ -30,6 +30,12 @@ def cases_of(family, quick):
     return FAMILIES[family].cases(quick)
 
 
+def cells_of(family, methods, quick):
+    """(stressor, method) of a family, method by method: those of a method share programs."""
+    cases = cases_of(family, quick)
+    return [(case.name, name) for name in methods for case in cases if case.applies(name)]
+
+
 def order(family, stressor, method):
     """Families, stressors and methods as they are listed; scenes and what is no more listed come last."""
     families, methods = list(FAMILIES), list(METHODS)
