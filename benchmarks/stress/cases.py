@@ -55,7 +55,7 @@ class Case:
     """One stressor.
 
     - `name`; `system`, `y0`, `args`; `t1` in s.
-    - `truth(times)`: (q, v) at these times, not from this library; `or_else(times)`: where the equations have two solutions.
+    - `truth(times)`: (q, v) at these times, not from this library; `or_else`: more of them, where the equations have several solutions.
     - `size`: of positions and of velocities, numbers or arrays like q: errors and drift are relative to it.
     - `rtol`; the absolute tolerance is `rtol` times the smallest size, at most 1.
     - `steps`, `rate`: of methods with fixed steps, how many, and the angular frequency that they must resolve, in 1/s.
@@ -84,7 +84,7 @@ class Case:
     times: int = 21
     energy: Callable[..., Any] | None = None
     only: tuple[str, ...] = ()
-    or_else: Callable[[np.ndarray], Any] | None = None
+    or_else: tuple[Callable[[np.ndarray], Any], ...] = ()
     fixed: bool = False
     off: float = 0.0
     bound: float | None = None

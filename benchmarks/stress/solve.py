@@ -58,7 +58,7 @@ def solved(case: Case, name: str) -> Outcome:
         return Outcome("failed" if end > 0 else "refused", str(in_words(sol)), **taken)
     q, v = map(np.asarray, sol.ys)
     errors = min(
-        (_errors(case, q, v, _known(truth, case.t1, case.times)) for truth in (case.truth, case.or_else) if truth),
+        (_errors(case, q, v, _known(truth, case.t1, case.times)) for truth in (case.truth, *case.or_else)),
         key=np.max,
     )
     drifts = np.nan * errors if case.system.constraint is None else _drifts(case, times, q, v)

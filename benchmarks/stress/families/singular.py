@@ -1,9 +1,10 @@
 """Configurations at and near a singularity of the constraints.
 
 A slider-crank whose rod is longer than its crank by δ, in θ and s, 0 = s² − 2 s sin θ − η with η = 2δ + δ²: at θ = 0 the slider turns
-within √η rad, which fixed steps do not see below 1e-6, and a drift of more than η makes another mechanism of it. At δ = 0 two
-motions cross there, the smooth one and the limit of small δ: each is a solution, and words are as good. A parallelogram passes its
-change point; two rods are pulled apart until they are straight, after which there is no state: a failure at that time is due.
+within √η rad, which fixed steps do not see below 1e-6, and a drift of more than η makes another mechanism of it. At δ = 0 three
+motions meet there, the smooth one and the limits of small δ of either sign: each is a solution, and words are as good. A
+parallelogram passes its change point; two rods are pulled apart until they are straight, after which there is no state: a failure
+at that time is due.
 """
 
 import itertools
@@ -93,6 +94,14 @@ def crossing(name, angle, rate, due, **rest):
     return Case(name, SLIDER, y0, 0.6, truth, args, (1.0, 4.0), rate=4.0, steps=4000, due=due, **rest)
 
 
+def turned_back(times):
+    """The limit from δ < 0, a rod shorter than the crank, which cannot pass: the mirror image of that from δ > 0."""
+    q, v = dead_centre(1e-15).truth(times)
+    past = q[:, 0] < 0
+    q[past, 0], v[past, 0] = -q[past, 0], -v[past, 0]
+    return q, v
+
+
 def parallelogram():
     """Cranks and base in one line: it goes on as a parallelogram, smoothly, or could change to an antiparallelogram."""
     pivot = np.array([2.0, 0.0])
@@ -138,7 +147,7 @@ def cases(quick):
     return [
         *(dead_centre(excess) for excess in (1e-1, 1e-3, 1e-6)),
         *(dead_centre(excess, only=with_tolerance()) for excess in (1e-9, 1e-12)),
-        crossing("dead centre exactly", 0.8, -2.0, "any", or_else=dead_centre(1e-15).truth),
+        crossing("dead centre exactly", 0.8, -2.0, "any", or_else=(dead_centre(1e-15).truth, turned_back)),
         crossing("from 1e-6 off the dead centre", 1e-6, 2.0, "any"),
         crossing("from the dead centre", 0.0, 2.0, "refusal"),
         parallelogram(),
