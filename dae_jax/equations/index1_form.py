@@ -55,13 +55,6 @@ class Index1Form(eqx.Module):
         return self.shown
 
     @property
-    def error_indices(self) -> tuple[int, ...]:
-        """By which errors are weighted, h^(k−1): 1 for the state; 2 for the derivatives of order Dⱼ > 0, of which h times the error
-        comes into the state, and whose round-off is amplified where the system is stiff.
-        """
-        return (1,) * self.ode.orders.size + tuple(2 if d else 1 for d in self.ode.orders.variables)
-
-    @property
     def may_cancel(self) -> bool:
         """Whether highest derivatives may cancel between equations."""
         return False

@@ -67,5 +67,5 @@ class ReducedResidual(AbstractResidualFormulation):
         form = Index1Form(ode, ode.selection(t, y, None)[0])
         z = form.encode(t, y)
         # The selection changes: the structure is that of all of them.
-        linearised = LinearisedResidual.of(form.with_all_candidates(y.dtype), z, form.error_indices)
+        linearised = LinearisedResidual.of(form.with_all_candidates(y.dtype), z)
         return z, eqx.tree_at(lambda p: p.form, linearised, form).starting(t, z)
