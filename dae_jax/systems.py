@@ -110,7 +110,9 @@ class ConstrainedSystem(AbstractSystem):
         if mass is None:
             return None
         if isinstance(mass, jax.Array | np.ndarray | float | int):
-            return jnp.asarray(mass)
+            mass = jnp.asarray(mass)
+            # Where q is one array of several axes, masses in its shape are no matrix.
+            return jnp.ravel(mass) if mass.ndim > 1 and mass.shape == getattr(q, "shape", None) else mass
         return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(mass)])
 
 

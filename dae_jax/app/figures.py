@@ -22,6 +22,10 @@ from . import plotting
 from .compare import Effort, Method, Row, solve
 
 
+# More curves in one picture cannot be told apart.
+CURVES = 9
+
+
 def write_data(
     scene: Scene, rows: list[Row], efforts: list[Effort], solutions: dict[str, Any], folder: Path
 ) -> list[Path]:
@@ -122,9 +126,13 @@ def _components(scene: Scene, name: str, sol: DAESolution) -> Any:
     curves = {}
     for letter, part in _parts(scene, sol):
         for i, component in enumerate(part.reshape(len(part), -1).T):
-            curves[f"{letter}[{i}]"] = (times, component / max(np.abs(component).max(), 1e-300))
+            # What is zero but for round-off is drawn as zero.
+            largest = max(np.abs(component).max(), 1e-12 * scene.scale)
+            curves[f"{letter}[{i}]"] = (times, component / largest)
+    shown = dict(list(curves.items())[:CURVES])
+    title = f"{scene.name} by {name}" + (f", the first {CURVES} of {len(curves)}" if len(curves) > CURVES else "")
     decades = scene.first is not None and scene.first < times[-1]
-    return plotting.over_time(curves, "value / largest value", f"{scene.name} by {name}", log_time=decades)
+    return plotting.over_time(shown, "value / largest value", title, log_time=decades)
 
 
 def _parts(scene: Scene, sol: DAESolution) -> list[tuple[str, np.ndarray]]:

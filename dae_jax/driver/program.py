@@ -83,6 +83,8 @@ class Solve(eqx.Module):
     progress_meter: diffrax.AbstractProgressMeter
 
     def __call__(self, problem: Problem) -> tuple[DAESolution, Any]:
+        backwards = problem.t1 < problem.t0
+        self = dataclasses.replace(self, formulation=self.formulation.towards(jnp.where(backwards, -1, 1)))
         numbers, arrays = self.kernel(problem)
         forward, _ = self._forwards().kernel(problem)
         pull_back = self._pull_back(problem)

@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Self
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Num
 
 from ..equations.constraint_jacobian import Rank
 from ..equations.manifold_ode import ManifoldODE
@@ -24,8 +25,9 @@ class Baumgarte(AbstractFieldFormulation):
         g̈ + 2α ġ + β² g = 0    in place of   g̈ = 0,
 
     and ḣ + α h = 0 for nonholonomic constraints. Errors decay like exp(s t) with s² + 2αs + β² = 0: critically damped
-    for α = β. Large values are stiff for an explicit solver. An equation of another system that has to be differentiated
-    c times gets the factor (d²/dt² + 2α d/dt + β²) c/2 times over, and (d/dt + α) for an odd c.
+    for α = β. Backwards in time they decay too: −α takes the place of α there. Large values are stiff for an explicit
+    solver. An equation of another system that has to be differentiated c times gets the factor
+    (d²/dt² + 2α d/dt + β²) c/2 times over, and (d/dt + α) for an odd c.
 
     **Arguments**
 
@@ -60,6 +62,10 @@ class Baumgarte(AbstractFieldFormulation):
                 f"`alpha` and `beta` of Baumgarte must be numbers, but have the shapes {np.shape(self.alpha)} and "
                 f"{np.shape(self.beta)}: batch over them with `jax.vmap`."
             )
+
+    def towards(self, sign: Num[ArrayLike, ""]) -> Self:
+        """With −α backwards in time: d/dt is −d/dτ in the time τ that the solve passes."""
+        return eqx.tree_at(lambda b: b.alpha, self, self.alpha * jnp.asarray(sign, self.alpha.dtype))
 
     def encode(
         self, system: System, t: Time, state: State, args: Args = None, rank: int | Rank | None = None

@@ -1,11 +1,12 @@
 """What a formulation is: which equations of a system are integrated, and by which kind of solver."""
 
 import abc
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
+from jaxtyping import ArrayLike, Num
 
 from ..equations.constraint_jacobian import Rank
 from ..equations.linearised import LinearisedResidual
@@ -20,6 +21,7 @@ class AbstractFormulation(eqx.Module):
     For those who call `diffrax.diffeqsolve` themselves:
 
         y0, ode = formulation.encode(system, t0, state, args)
+        formulation = formulation.towards(jnp.sign(t1 - t0))
         sol = diffrax.diffeqsolve(formulation.term(), solver, t0, t1, dt0, y0, args=ode)
         state = formulation.decode(t, y, ode)
 
@@ -48,6 +50,10 @@ class AbstractFormulation(eqx.Module):
 
     def refuse(self, system: System) -> None:
         """Refuses, by a `ValueError` with advice, what the formulation is not for."""
+
+    def towards(self, sign: Num[ArrayLike, ""]) -> Self:
+        """The formulation for a solve in which time runs forwards, `sign` 1, or backwards, −1."""
+        return self
 
     @abc.abstractmethod
     def encode(

@@ -22,6 +22,7 @@ from .surfaces import bead_on_torus as bead_on_torus, knife_edge as knife_edge
 from .wheelset import wheelset as wheelset
 
 
+# The scenes by their names on the command line, each a function without arguments that makes it.
 SCENES: dict[str, Callable[[], Scene[System]]] = {
     "akzo-nobel": akzo_nobel,
     "amplifier": amplifier,

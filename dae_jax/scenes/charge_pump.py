@@ -81,11 +81,11 @@ def _state(voltage: float, current: float) -> np.ndarray:
 
 
 def _reference(times: np.ndarray):
-    # The current is known where the voltage does not change, and at the end, where it is published.
+    # The current is known where the voltage does not change, and at the end, where it is published; at a kink it jumps.
     current = lambda t: 0.1522565920949845e-3 if t == END else np.nan if _changes(t) else 0.0
     return np.stack([_state(float(_pulse(np, t)), current(t)) for t in np.asarray(times, float)])
 
 
 def _changes(t: Time):
-    within = t % PERIOD
-    return RISES < within < STAYS or within > FALLS
+    within, near = t % PERIOD, 1e-9 * PERIOD
+    return RISES - near < within < STAYS + near or within > FALLS - near or (within < near and t > near)

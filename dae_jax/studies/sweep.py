@@ -17,11 +17,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
+from jax.extend.core import ClosedJaxpr
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from ..compiler import processors
+from ..compiler.jaxprs.walk import equations, jaxprs_in
 from ..driver.failures import sentence_of
 from ..solution import RESULTS
 from ..types import State
@@ -261,11 +263,13 @@ def _gathered(x: np.ndarray) -> np.ndarray:
 
 
 def _fingerprint(fn: Callable[..., PyTree], elements: PyTree, chunk: int) -> str:
-    """What makes two sweeps the same: the function as it is traced, its constants, the elements, and the chunks."""
+    """What makes two sweeps the same: the function as it is traced, its constants at any depth, the elements, and the chunks."""
     one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], jax.dtypes.canonicalize_dtype(x.dtype)), elements)
     closed = jax.make_jaxpr(fn)(one)
     found = hashlib.sha256(re.sub(r"0x[0-9a-f]+", "", str(closed)).encode())
-    for x in [*closed.consts, *jax.tree.leaves(elements)]:
+    inner = (jaxpr for eqn in equations(closed) for jaxpr in jaxprs_in(tuple(eqn.params.values())))
+    constants = (x for jaxpr in (closed, *inner) if isinstance(jaxpr, ClosedJaxpr) for x in jaxpr.consts)
+    for x in [*constants, *jax.tree.leaves(elements)]:
         x = np.asarray(x)
         found.update(f"{x.dtype}{x.shape}".encode() + x.tobytes())
     found.update(f"{chunk} {jax.__version__} {jnp.zeros(()).dtype}".encode())

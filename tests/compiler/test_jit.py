@@ -317,3 +317,17 @@ class TestWhatJaxIsToldForDebugging:
 
         with jax.disable_jit():
             assert jit(fn)(0.5) == fn(0.5) == 24.0
+
+
+ALIKE = (np.array(0.1234567890123), np.array(0.1234567891))
+
+
+@pytest.mark.parametrize(
+    ("a", "b"), [ALIKE, np.float32(ALIKE), (np.array(0.0), np.array(-0.0)), (np.array(7), np.array(7.0))]
+)
+def test_numbers_that_look_alike_are_told_apart(only_ours, a, b):
+    def both(x):
+        return jnp.stack([jnp.copysign(x, a * x), jnp.copysign(x, b * x), x * a, x * b, x + a, x + b])
+
+    for fn in (both, lambda x: jax.lax.fori_loop(0, 3, lambda i, y: both(x) + y, 0 * both(x))):
+        np.testing.assert_array_equal(jit(fn)(X), jax.jit(fn)(X))

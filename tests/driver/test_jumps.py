@@ -66,7 +66,7 @@ def test_batch_is_one_at_a_time():
     together = jax.vmap(lambda e: bouncing(e, 2.2, throw=False))(jnp.array([0.2, 0.8, 0.9]))
     np.testing.assert_allclose(together.ys[0][1:, -1, 1], [end(0.8), end(0.9)], rtol=1e-10, atol=1e-12)
     assert list(together.result == dae_jax.RESULTS.successful) == [False, True, True]
-    with pytest.raises(RuntimeError, match="more jumps"):
+    with pytest.raises(RuntimeError, match="more resets"):
         end(0.2)
 
 

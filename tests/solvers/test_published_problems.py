@@ -49,6 +49,13 @@ def test_the_reference_of_the_charge_pump_is_the_published_one():
     np.testing.assert_allclose(end, [0.1262800429876759e-12, *7 * [0], 0.1522565920949845e-3], atol=1e-20)
 
 
+def test_the_reference_of_the_charge_pump_knows_no_current_where_it_jumps():
+    kinks = np.array(PUMP.kinks)
+    assert np.isnan(PUMP.reference(kinks)[:, 8]).all()
+    beside = PUMP.reference(np.array([0.0, 1e-9, 49e-9, 61e-9, 109e-9, 121e-9]))
+    np.testing.assert_array_equal(beside[:, 8], 0)
+
+
 def test_the_elastic_crank_starts_as_published():
     """The published accelerations and multipliers satisfy the equations of motion to their digits."""
     scene = elastic_crank()

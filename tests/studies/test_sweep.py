@@ -104,6 +104,16 @@ def test_a_store_is_taken_up_again_and_refuses_another_sweep(tmp_path):
             other()
 
 
+@pytest.mark.parametrize("of", [lambda f: f, jax.jit, lambda f: lambda x: jax.lax.map(jax.jit(f), x[None])[0]])
+def test_functions_that_differ_in_a_constant_alone_are_other_sweeps(tmp_path, of):
+    one, close = np.array([0.1234567890123, 1.0, 2.0]), np.array([0.1234567891, 1.0, 2.0])
+    sweep = lambda c: dae_jax.sweep(of(lambda x: x * c), np.ones(4), store=tmp_path / "s", progress=False)
+    np.testing.assert_array_equal(sweep(one), np.tile(one, (4, 1)))
+    for c in (close, close[0], float(close[0]), one[0]):
+        with pytest.raises(ValueError, match="holds another sweep"):
+            sweep(c)
+
+
 def test_a_folder_of_something_else_is_refused(tmp_path):
     (tmp_path / "thesis.txt").write_text("mine")
     with pytest.raises(OSError, match="other files in it"):

@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
 from jaxtyping import Array
 
@@ -122,8 +123,8 @@ def _key(params: Params) -> Hashable:
 
 
 def _atom(x: Atom) -> Hashable:
-    # By its text: 0 and −0 are equal, and not the same.
-    return (repr(x.val), aval_of(x).dtype) if isinstance(x, Literal) else x
+    # By its bits: 0 and −0 are equal, and not the same; its text has eight digits.
+    return (np.asarray(x.val).tobytes(), aval_of(x).dtype) if isinstance(x, Literal) else x
 
 
 def _meaning(eqn: Equation) -> ClosedJaxpr:

@@ -58,6 +58,8 @@ class _Polynomials(ScalarInterpreter[Entry]):
     def __init__(self, limit: int) -> None:
         super().__init__(limit)
         self.known: dict[Hashable, int] = {}
+        # Kept, so that none gets the address of one that has gone.
+        self.constants: list[Array] = []
 
     def unknowns(self, name: Hashable, shape: tuple[int, ...]) -> np.ndarray:
         return objects([self.unknown((name, i)) for i in range(int(np.prod(shape)))], shape)
@@ -67,6 +69,7 @@ class _Polynomials(ScalarInterpreter[Entry]):
         return {(self.known.setdefault(name, len(self.known)),): 1.0}
 
     def traced(self, x: Array) -> np.ndarray:
+        self.constants.append(x)
         return self.unknowns(("traced", id(x)), x.shape)
 
     def opaque(self, eqn: Equation, args: list[np.ndarray]) -> list[np.ndarray]:

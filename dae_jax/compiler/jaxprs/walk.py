@@ -29,6 +29,7 @@ CALLS = {
 }
 # They have a derivative of their own, and the last one a batch.
 WITH_DERIVATIVE = {"custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr"}
+# Every primitive that calls a jaxpr, with the parameter that has it.
 ALL_CALLS = {**CALLS, **WITH_DERIVATIVE, "custom_vmap_call": "call"}
 
 # Parameters that hold no jaxpr.

@@ -1,0 +1,268 @@
+"""python -m tests.break_formulas [NAME ...]: breaks one formula after the other, each in a copy of the tree, and says whether the
+tests that are named with it fail.
+"""
+
+import dataclasses
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+
+ROOT = Path(__file__).parents[1]
+# Of pytest: all passed, some failed.
+PASSED, FAILED = 0, 1
+
+
+@dataclasses.dataclass(frozen=True)
+class Break:
+    """A file of dae_jax, one piece of its text, what stands there instead, and the tests that should fail then, as pytest takes
+    them.
+    """
+
+    path: str
+    old: str
+    new: str
+    tests: str
+
+    def missed(self) -> str | None:
+        """What pytest says where no test fails."""
+        with tempfile.TemporaryDirectory() as folder:
+            tree = Path(folder)
+            for name in ("dae_jax", "tests"):
+                shutil.copytree(ROOT / name, tree / name, ignore=shutil.ignore_patterns("__pycache__"))
+            shutil.copy(ROOT / "pyproject.toml", tree)
+            broken = tree / "dae_jax" / self.path
+            text = broken.read_text()
+            assert text.count(self.old) == 1, f"{self.path} has {self.old!r} {text.count(self.old)} times"
+            broken.write_text(text.replace(self.old, self.new))
+            command = [
+                sys.executable,
+                "-m",
+                "pytest",
+                "-q",
+                "-x",
+                "--no-header",
+                "-p",
+                "no:cacheprovider",
+                *self.tests.split(),
+            ]
+            done = subprocess.run(
+                command, cwd=tree, env={**os.environ, "PYTHONPATH": folder}, capture_output=True, text=True
+            )
+        assert done.returncode in (PASSED, FAILED), done.stdout + done.stderr
+        return done.stdout if done.returncode == PASSED else None
+
+
+def _order(method: str) -> str:
+    return f"tests/solvers/test_methods.py::test_order_is_measured[{method}]"
+
+
+_BACKWARDS = "tests/solvers/test_methods.py::test_backwards_in_time_with_a_constraint_that_depends_on_time"
+_FORMULAS = "tests/equations/test_formulas.py"
+_COEFFICIENTS = "tests/solvers/test_coefficients.py"
+
+BREAKS = {
+    # Formulations
+    "Baumgarte: 2α": Break(
+        "formulations/baumgarte.py", "2 * self.alpha, self.beta**2", "self.alpha, self.beta**2",
+        f"{_FORMULAS}::test_baumgartes_polynomials",
+    ),
+    "Baumgarte: nonholonomic": Break(
+        "formulations/baumgarte.py", "_product(polynomial, [1.0, self.alpha])", "_product(polynomial, [1.0, 2 * self.alpha])",
+        f"{_FORMULAS}::test_baumgartes_polynomials",
+    ),
+    "Baumgarte: backwards in time": Break(
+        "formulations/baumgarte.py", "self.alpha * jnp.asarray(sign", "self.alpha + 0 * jnp.asarray(sign",
+        "tests/solvers/test_symmetries.py::test_time_may_be_shifted_and_reversed[baumgarte]",
+    ),
+    "state space: sign of the bias": Break(
+        "formulations/state_space.py", "- apply(bias)", "+ apply(bias)",
+        "tests/solvers/test_paper.py::test_accuracy_at_1e_10[double-pendulum-5.0-1e-07-state-space]",
+    ),
+    # Solvers
+    "RATTLE: whole step": Break("solvers/rattle.py", "half = v0 + h / 2", "half = v0 + h", _order("rattle")),
+    "RATTLE: normals of the start": Break(
+        "solvers/rattle.py", "(q1, free), args.normals(t1_, (q1, free)))", "(q1, free), chart)", _order("rattle")
+    ),
+    "symmetric projection: −μ": Break(
+        "solvers/symmetric_projection.py", "args.displace(end, args.normals(sign * t1, y1), mu)",
+        "args.displace(end, args.normals(sign * t1, y1), -mu)",
+        "tests/solvers/test_methods.py::test_symmetric_projection_goes_back_to_where_it_came_from",
+    ),
+    "chart: time of the stages backwards": Break(
+        "solvers/chart_steps.py", "ode.retract_along(sign * t, u, chart)", "ode.retract_along(t, u, chart)",
+        f"{_BACKWARDS}[solver1]",
+    ),
+    "projection: time backwards": Break(
+        "solvers/orthogonal_projection.py", "args.project(sign * t, y)", "args.project(t, y)", f"{_BACKWARDS}[solver0]"
+    ),
+    "Gauss: node": Break("solvers/gauss.py", "3**0.5 / 6", "3**0.5 / 5", _order("gauss4")),
+    "implicit stages: all at the end": Break(
+        "solvers/implicit.py", "t0 + float(c) * (t1 - t0)", "t1", f"{_FORMULAS}::test_implicit_stages_have_their_own_times[gauss4]"
+    ),
+    "explicit stages: off by one": Break(
+        "solvers/explicit.py", "ti = t1 if ci == 1 else t0 + float(ci) * (t1 - t0)", "ti = t0",
+        f"{_FORMULAS}::test_explicit_stages_have_their_own_times",
+    ),
+    "trapezoidal rule: weights": Break(
+        "solvers/trapezoid.py", "[1 / 2, 1 / 2]], [1 / 2, 1 / 2]", "[1 / 3, 2 / 3]], [1 / 3, 2 / 3]", _order("trapezoid")
+    ),
+    "midpoint rule: node": Break("solvers/midpoint.py", "[[1 / 2]]", "[[1 / 3]]", _order("midpoint")),
+    "DOP853: the two estimates": Break(
+        "solvers/dop853.py", "0.01 * three", "three", f"{_COEFFICIENTS}::TestDOP853::test_the_estimates_are_combined"
+    ),
+    "DOP853: interpolant": Break(
+        "solvers/dop853.py", "2 * change - (first + last)", "2 * change - first",
+        f"{_COEFFICIENTS}::TestDOP853::test_the_interpolant_has_order_seven",
+    ),
+    "DOP853: sign of a coefficient of E5": Break(
+        "solvers/dop853_coefficients.py", "    -0.4957589496572502,", "    0.4957589496572502,",
+        f"{_COEFFICIENTS}::TestDOP853::test_order_conditions",
+    ),
+    "Radau: embedded formula": Break(
+        "solvers/radau_coefficients.py", "-(13 + 7 * ROOT), -13", "13 + 7 * ROOT, -13",
+        f"{_COEFFICIENTS}::TestRadau::test_the_embedded_formula_has_order_three",
+    ),
+    "Radau: complex matrix": Break(
+        "solvers/radau.py", "lax.complex(ALPHA / self.h, BETA / self.h)", "lax.complex(ALPHA / self.h, -BETA / self.h)",
+        f"{_COEFFICIENTS}::TestRadau::test_a_linear_step_takes_one_correction",
+    ),
+    "Radau: way between the steps": Break(
+        "solvers/radau.py", "c[0] + s * (c[1] + s * c[2])", "c[0] + s * (c[1] - s * c[2])",
+        "tests/solvers/test_radau.py::test_between_steps_the_solution_is_the_collocation_polynomial",
+    ),
+    "Radau: prediction of the stages": Break(
+        "solvers/radau.py", "1 + float(c) * ratio", "float(c) * ratio",
+        f"{_COEFFICIENTS}::TestRadau::test_stages_are_predicted_on_the_last_polynomial",
+    ),
+    "weights of higher indices": Break(
+        "equations/linearised.py", "np.maximum(indices - 1, 0)", "np.maximum(indices - 2, 0)",
+        f"{_COEFFICIENTS}::TestRadau::test_the_errors_of_higher_indices_count_less",
+    ),
+    "BDF: leading coefficient": Break(
+        "solvers/bdf.py", "jnp.where(j <= k, 1 / j, 0)", "jnp.where(j < k, 1 / j, 0)", f"{_COEFFICIENTS}::TestBDF"
+    ),
+    "BDF: error constants": Break(
+        "solvers/bdf.py", "sigma[-1] * j * alpha[j]", "sigma[-1] * alpha[j]", f"{_COEFFICIENTS}::TestBDF"
+    ),
+    "BDF: prediction of the rate": Break(
+        "solvers/bdf.py", "gamma[-1] + 1 / new[j - 1]", "gamma[-1] + 1 / old[j - 1]", f"{_COEFFICIENTS}::TestBDF"
+    ),
+    "BDF: way between the steps": Break(
+        "solvers/bdf.py", "(self.psi[j - 1] if j else 0)", "self.psi[j]",
+        "tests/solvers/test_bdf.py::test_between_steps_the_solution_is_as_accurate",
+    ),
+    # Equations
+    "dummy derivatives: what is integrated": Break(
+        "equations/index1_form.py", "integrated * rates + jnp", "rates + jnp",
+        "tests/solvers/test_dummy_residuals.py::test_order_five",
+    ),
+    "nonholonomic rows: ∂h/∂v": Break(
+        "equations/mechanical.py", "jax.jacfwd(self._nonholonomic, 2)", "jax.jacfwd(self._nonholonomic, 1)",
+        f"{_FORMULAS}::test_rolling_is_a_constraint_of_velocities",
+    ),
+    "consistent state: fixed velocities": Break(
+        "consistent.py", "_least_norm(a, metric(wv, a)", "_least_norm(a, metric(wq, a)",
+        f"{_FORMULAS}::test_consistent_velocities_keep_what_is_fixed",
+    ),
+    "accelerations: sign of the bias": Break(
+        "equations/mechanical.py", "target = self.linear.along(self, normals, free) + target",
+        "target = self.linear.along(self, normals, free) - target", _order("differentiation"),
+    ),
+    "∂g/∂t dropped": Break(
+        "equations/mechanical.py", "(jnp.ones_like(t), *direction)", "(jnp.zeros_like(t), *direction)", f"{_BACKWARDS}[solver0]"
+    ),
+    "displacement: velocities by μ of the positions": Break(
+        "equations/mechanical.py", "v + self.linear.lift(self, normals, mu[m:])", "v + self.linear.lift(self, normals, mu[:m])",
+        _order("projection-euler"),
+    ),
+    "M for M⁻¹": Break(
+        "equations/constraint_jacobian.py", "return x / (mass[:, None]", "return x * (mass[:, None]",
+        f"{_FORMULAS}::test_multipliers_of_unequal_masses",
+    ),
+    "M for M⁻¹, sparse": Break(
+        "equations/constraint_jacobian.py", "return 1 / (jnp.broadcast_to", "return 1 * (jnp.broadcast_to",
+        f"{_FORMULAS}::test_multipliers_of_unequal_masses",
+    ),
+    "residual: sign of λ": Break(
+        "equations/residual_form.py", "ode.force(t, q, v) + jnp.sum(multipliers", "ode.force(t, q, v) - jnp.sum(multipliers",
+        f"{_FORMULAS}::test_residual_forms_of_unequal_masses",
+    ),
+    "Taylor: no factorial": Break(
+        "equations/taylor.py", "y[k - 1] + s / k * value", "y[k - 1] + s * value",
+        f"{_FORMULAS}::test_nested_derivatives_are_taylors",
+    ),
+    # Linear algebra
+    "substitution: off by one": Break(
+        "linalg/dense.py", "for k in range(i + 1, n))) / rows[i][i]", "for k in range(i + 2, n))) / rows[i][i]",
+        "tests/equations/test_linalg.py::TestSolve::test_equals_numpy",
+    ),
+    "implicit function: sign": Break(
+        "linalg/newton.py", "dx = -linear_solve(", "dx = linear_solve(",
+        "tests/equations/test_linalg.py -k first_and_second_derivatives",
+    ),
+    "elimination: sign": Break(
+        "linalg/elimination.py", "eliminated = eliminated - f * take(x, neighbour)",
+        "eliminated = eliminated + f * take(x, neighbour)",
+        "tests/equations/test_linalg.py::TestElimination::test_equals_numpy[tree]",
+    ),
+    # Structure
+    "index: algebraic variables": Break(
+        "structure/sigma.py", "(1 if 0 in d else 0)", "0", "tests/structure/test_structure.py::test_published_offsets"
+    ),
+    "Pantelides: highest derivatives": Break(
+        "structure/pantelides.py", "for variable in reached_from:\n                orders[variable] += 1",
+        "for variable in reached_from:\n                orders[variable] += 2",
+        "tests/structure/test_structure.py::test_sigma_method_and_pantelides_agree",
+    ),
+    "index of a variable": Break(
+        "structure/sigma.py", "max(1 + top - variable_offsets[variable], 0)", "max(top - variable_offsets[variable], 0)",
+        f"{_FORMULAS}::test_indices_of_a_mechanisms_variables",
+    ),
+    # Driver
+    "adjoint: share of the start": Break(
+        "driver/trajectory_adjoint.py", "return (1 - fraction) * cotangent", "return cotangent",
+        "tests/driver/test_tape.py::test_equals_diffrax_with_respect_to_everything",
+    ),
+    "jump: the wrong way from zero": Break(
+        "driver/resets.py", "jnp.where(rate > 0, zero, -zero)", "jnp.where(rate > 0, -zero, zero)",
+        "tests/driver/test_jumps.py::test_a_crossing_of_an_algebraic_variable_is_one_jump",
+    ),
+    # Studies and diagnostics
+    "energy: ½": Break(
+        "diagnostics.py", "jnp.dot(flat_v, momentum) / 2", "jnp.dot(flat_v, momentum)",
+        f"{_FORMULAS}::test_energy_of_a_full_mass_matrix",
+    ),
+    "Lyapunov: per time": Break(
+        "studies/reductions.py", "/ _norm(start)) / (t1 - t0)", "/ _norm(start)) * (t1 - t0)",
+        "tests/studies/test_sweep.py -k lyapunov",
+    ),
+    "stiffness of α and β": Break(
+        "studies/baumgarte_loss.py", '4 * params["alpha"] ** 2 + 2 *', '2 * params["alpha"] ** 2 + 2 *',
+        f"{_FORMULAS}::test_stiffness_of_baumgartes_feedback",
+    ),
+    "descent: way back": Break(
+        "studies/tune.py", "(point.z + best_z) / 2", "point.z + best_z / 2",
+        "tests/studies/test_tune.py::test_holes_are_left_and_never_the_best",
+    ),
+}  # fmt: skip
+
+
+def main(names: list[str]) -> int:
+    missed = 0
+    for name in names or BREAKS:
+        start = time.monotonic()
+        said = BREAKS[name].missed()
+        missed += said is not None
+        print(f"{name}: {'found' if said is None else 'NOT FOUND'} ({time.monotonic() - start:.0f} s)", flush=True)
+        print(said or "", end="", flush=True)
+    print(f"{len(names or BREAKS) - missed} of {len(names or BREAKS)} found")
+    return missed
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,1 @@
+"""Mechanisms put together at random, and what must hold of each."""
