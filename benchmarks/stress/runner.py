@@ -18,9 +18,9 @@ from .worker import FULL
 
 ROOT = Path(__file__).parents[2]
 # Seconds of processor time for a cell, compilation included; of time on the clock so many times that, and for the worker to start.
-LIMIT, PATIENCE, START = 120, 10, 60
+LIMIT, PATIENCE, START = 40, 10, 60
 # GiB for a worker.
-MEMORY = 6
+MEMORY = 4
 
 
 def run(
