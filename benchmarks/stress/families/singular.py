@@ -3,7 +3,8 @@
 A slider-crank whose rod is longer than its crank by δ, in θ and s, 0 = s² − 2 s sin θ − η with η = 2δ + δ²: at θ = 0 the slider turns
 within √η rad, which fixed steps do not see below 1e-6, and a drift of more than η makes another mechanism of it. At δ = 0 three
 motions meet there, the smooth one and the limits of small δ of either sign: each is a solution, and words are as good. A
-parallelogram passes its change point; two rods are pulled apart until they are straight, after which there is no state: a failure
+parallelogram passes its change point, or turns there into an antiparallelogram of the same energy, as it does in the limit of links
+that are a little too long or too short; two rods are pulled apart until they are straight, after which there is no state: a failure
 at that time is due.
 """
 
@@ -11,7 +12,7 @@ import itertools
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.integrate import quad
+from scipy.integrate import quad, solve_ivp
 from scipy.optimize import brentq
 
 import dae_jax as dj
@@ -122,7 +123,44 @@ def parallelogram():
 
     y0 = tuple(x[0] for x in truth(np.zeros(1)))
     system = dj.ConstrainedSystem(force, constraint)
-    return Case("parallelogram passes its change point", system, y0, 1.0, truth, size=(2.0, 6.0), rate=6.0, due="any")
+    crossed = tuple(antiparallelogram(truth, pivot, way) for way in (1, -1))
+    return Case(
+        "parallelogram passes its change point", system, y0, 1.0, truth, size=(2.0, 6.0), rate=6.0, due="any", or_else=crossed
+    )  # fmt: skip
+
+
+def antiparallelogram(before, pivot, way):
+    """times → (q, v): `before`, and from where the cranks lie along the base the other motion, in which tan(β/2) = −3 tan(α/2) for their
+    angles α and β above it and (α̇² + β̇²)/2 + g (sin α + sin β), with y down, has the same value; α goes `way`.
+    """
+    g = 9.81
+    other = lambda a: -2 * np.arctan2(3 * np.sin(a / 2), np.cos(a / 2))
+    ratio = lambda a: -3 / (1 + 8 * np.sin(a / 2) ** 2)
+    bend = lambda a: 12 * np.sin(a) / (1 + 8 * np.sin(a / 2) ** 2) ** 2
+
+    def field(t, z):
+        a, rate = z
+        r = ratio(a)
+        weight = g * (np.cos(a) + r * np.cos(other(a)))
+        return rate, (weight - r * bend(a) * rate**2) / (1 + r**2)
+
+    def truth(times):
+        t = np.asarray(times, float)
+        meets = brentq(lambda t: before([t])[0][0, 1], 0, 0.5, xtol=1e-15)
+        speed = np.linalg.norm(before([meets])[1]) / np.sqrt(1 + ratio(0.0) ** 2)
+        q, v = before(t)
+        late = t > meets
+        if late.any():
+            found = solve_ivp(
+                field, (meets, t[-1]), (0.0, way * speed), "DOP853", t[late], rtol=1e-13, atol=1e-14
+            ).y  # fmt: skip
+            a, rate = found
+            for angle, turning, at, base in ((a, rate, slice(0, 2), 0 * pivot), (other(a), ratio(a) * rate, slice(2, 4), pivot)):
+                q[late, at] = base + np.stack([np.cos(angle), np.sin(angle)], -1)
+                v[late, at] = turning[:, None] * np.stack([-np.sin(angle), np.cos(angle)], -1)
+        return q, v
+
+    return truth
 
 
 def pulled_apart():
