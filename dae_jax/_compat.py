@@ -15,3 +15,8 @@ CALLBACK_LOG = "jax._src.callback"
 def messages(enumeration: type) -> list[str]:
     """The messages of an equinox enumeration by number; what is written here is said."""
     return getattr(enumeration, "_index_to_message")  # noqa: B009
+
+
+def is_captured(error: TypeError) -> bool:
+    """Whether a compiled function closes over a number that is being differentiated."""
+    return str(error).startswith("No constant handler for type") and "Tracer" in str(error)

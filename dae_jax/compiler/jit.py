@@ -17,7 +17,7 @@ from .jaxprs.checks import checks_apart
 from .jaxprs.expansions import expanded
 from .jaxprs.scalar_interpreter import Unsupported
 from .kernel_call import called
-from .linear_map import Arrays, derivative_map, is_inexact
+from .linear_map import Arrays, batched_alike, derivative_map, is_inexact
 from .settings import one_kernel_enabled
 
 
@@ -128,7 +128,7 @@ def _differentiable(fn: Callable[..., Arrays]) -> Callable[..., Arrays]:
 
     @jax.custom_jvp
     def call(*xs: Array) -> Arrays:
-        return _kernel(fn)(*xs)
+        return list(batched_alike(*_kernel(fn)(*xs)))
 
     @functools.partial(call.defjvp, symbolic_zeros=True)
     def _(xs: Sequence[Array], dxs: Sequence[Array]) -> Any:

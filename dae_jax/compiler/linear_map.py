@@ -46,6 +46,20 @@ class LinearMap:
         return linear_p.bind(*at, *x, of=self, avals=avals)
 
 
+@jax.custom_batching.custom_vmap
+def batched_alike(*xs: Array) -> tuple[Array, ...]:
+    """These, in a batch all of them batched, as what a `LinearMap` gives is: of a function with a rule for its derivative JAX takes
+    a value for batched whose derivative is, and one that is not for a value of another shape.
+    """
+    return xs
+
+
+@batched_alike.def_vmap
+def _(size: int, batched: Sequence[bool], *xs: Array) -> Any:
+    alike = (x if b else jnp.broadcast_to(x, (size, *jnp.shape(x))) for x, b in zip(xs, batched, strict=True))
+    return batched_alike(*alike), (True,) * len(xs)
+
+
 def is_inexact(x: ArrayLike) -> bool:
     """Whether an array has derivatives."""
     return jnp.issubdtype(jnp.result_type(x), jnp.inexact)

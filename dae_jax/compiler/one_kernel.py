@@ -14,7 +14,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from .kernel_call import as_kernel
-from .linear_map import Arrays, LinearMap, forward_map, is_inexact, moved
+from .linear_map import Arrays, LinearMap, batched_alike, forward_map, is_inexact, moved
 from .settings import one_kernel_enabled
 from .types import TreeDef
 
@@ -50,7 +50,8 @@ def _reverse(fn: Callable[..., Any], pull_back: PullBack | None, forward: Callab
 
         @jax.custom_jvp
         def solve(*xs: Array) -> Any:
-            return kernel(*jax.tree.unflatten(treedef, xs))
+            out, of_ys = jax.tree.flatten(kernel(*jax.tree.unflatten(treedef, xs)))
+            return jax.tree.unflatten(of_ys, batched_alike(*out))
 
         @solve.defjvp
         def _(xs: Sequence[Array], dxs: Sequence[Array]) -> Any:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from .._compat import trace_state_clean
+from .._compat import is_captured, trace_state_clean
 from ..compiler import PullBack, inexact, one_kernel, waiting
 from ..compiler.types import Arrays
 from ..consistent import look_at_end, look_at_start
@@ -65,6 +65,13 @@ def run(program: Program, arrays: Arrays) -> tuple[DAESolution, Any, float]:
     _make_room()
     try:
         sol, as_expected = _jitted(program, arrays)
+    except TypeError as error:
+        if is_captured(error):
+            raise TypeError(
+                "A number that is being differentiated is held by an object that is no pytree (an attribute, a global "
+                "variable), where the solve cannot see it. Hand it over through `args`, or make the object an `equinox.Module`."
+            ) from error
+        raise
     finally:
         seconds = waiting.end()
     return sol.whole(), as_expected, seconds

@@ -13,7 +13,7 @@ import optimistix
 import pytest
 
 import dae_jax
-from dae_jax.compiler import jit, kernel_call
+from dae_jax.compiler import jit, kernel_call, one_kernel
 
 
 X = jnp.array([0.3, 0.5, 0.7])
@@ -331,3 +331,18 @@ def test_numbers_that_look_alike_are_told_apart(only_ours, a, b):
 
     for fn in (both, lambda x: jax.lax.fori_loop(0, 3, lambda i, y: both(x) + y, 0 * both(x))):
         np.testing.assert_array_equal(jit(fn)(X), jax.jit(fn)(X))
+
+
+def test_a_value_that_is_the_same_for_a_batch_has_its_shape_within_derivatives():
+    def both(k, one):
+        return jax.lax.fori_loop(0, 3, lambda i, x: x * k, k), 2 * one
+
+    for fn in (jit(both), one_kernel(both, "reverse")):
+
+        def value(k, fn=fn):
+            x, same = fn(k, jnp.ones(()))
+            return jax.lax.cond(k > 0, lambda: x * same, lambda: same)
+
+        for slope in (jax.grad, jax.jacfwd):
+            found = slope(lambda k: jax.vmap(jax.jit(value))(jnp.stack([k, 2 * k])).sum())(1.5)
+            np.testing.assert_allclose(found, 17 * 8 * 1.5**3, rtol=1e-14)

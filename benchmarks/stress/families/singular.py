@@ -155,7 +155,10 @@ def antiparallelogram(before, pivot, way):
                 field, (meets, t[-1]), (0.0, way * speed), "DOP853", t[late], rtol=1e-13, atol=1e-14
             ).y  # fmt: skip
             a, rate = found
-            for angle, turning, at, base in ((a, rate, slice(0, 2), 0 * pivot), (other(a), ratio(a) * rate, slice(2, 4), pivot)):
+            for angle, turning, at, base in (
+                (a, rate, slice(0, 2), 0 * pivot),
+                (other(a), ratio(a) * rate, slice(2, 4), pivot),
+            ):
                 q[late, at] = base + np.stack([np.cos(angle), np.sin(angle)], -1)
                 v[late, at] = turning[:, None] * np.stack([-np.sin(angle), np.cos(angle)], -1)
         return q, v

@@ -1,0 +1,138 @@
+"""Numbers that functions of the user close over are numbers like those in `args`, whatever traces them."""
+
+import functools
+import itertools
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix
+import pytest
+
+import dae_jax
+from dae_jax.driver import program
+
+
+GRAVITY = jnp.array([0.0, -9.81])
+START = (jnp.array([1.0, 0.0]), jnp.zeros(2))
+
+
+def circle(t, q, args):
+    return (q @ q - 1) / 2
+
+
+def last_angle(force, args=None, solver=None, **options):
+    system = dae_jax.ConstrainedSystem(force, circle)
+    solver = solver or dae_jax.OrthogonalProjection(diffrax.Tsit5())
+    x, y = dae_jax.daesolve(system, solver, 0.0, 0.5, 0.05, START, args, **options).final[0]
+    return jnp.atan2(y, x)
+
+
+def by_args(k):
+    return last_angle(lambda t, q, v, k: k * GRAVITY - 0.1 * k**2 * v, k)
+
+
+def drag(k):
+    return lambda v: 0.1 * k**2 * v
+
+
+def by_default(k):
+    return last_angle(lambda t, q, v, args, k=k: k * GRAVITY - drag(k)(v))
+
+
+def by_keyword(k):
+    def force(t, q, v, args, *, k=k):
+        return k * GRAVITY - 0.1 * k**2 * v
+
+    return last_angle(force)
+
+
+def by_functions_within(k):
+    of_v, parts = drag(k), {"k": k, 3: "not to be sorted"}
+    return last_angle(lambda t, q, v, args: (k if parts else parts["k"]) * GRAVITY - of_v(v))
+
+
+def by_partial(k):
+    return last_angle(functools.partial(lambda scale, t, q, v, args, of_v: scale * GRAVITY - of_v(v), k, of_v=drag(k)))
+
+
+CAPTURED = {
+    "closure": lambda k: last_angle(lambda t, q, v, args: k * GRAVITY - 0.1 * k**2 * v),
+    "dictionary": lambda k: (lambda p: last_angle(lambda t, q, v, args: p["k"] * GRAVITY - 0.1 * p["k"] ** 2 * v))({"k": k}),
+    "jitted": lambda k: last_angle(jax.jit(lambda t, q, v, args: k * GRAVITY - 0.1 * k**2 * v)),
+    "default": by_default,
+    "keyword": by_keyword,
+    "functions within": by_functions_within,
+    "partial": by_partial,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("way", CAPTURED)
+def test_however_a_function_has_captured_a_number(way):
+    assert "kernel[" in str(jax.make_jaxpr(CAPTURED[way])(1.1))
+    np.testing.assert_allclose(jax.jit(CAPTURED[way])(1.1), by_args(1.1), rtol=1e-14)
+
+
+def test_a_function_that_is_made_anew_for_each_number_is_compiled_once():
+    fn = jax.value_and_grad(CAPTURED["closure"])
+    fn(1.1)
+    before = len(program._traced)
+    np.testing.assert_allclose(fn(1.2), jax.value_and_grad(by_args)(1.2), rtol=1e-13)
+    assert len(program._traced) - before <= 1  # of `by_args`
+
+
+TRANSFORMATIONS = {
+    "jit": jax.jit,
+    "vmap": lambda f: lambda k: jax.vmap(f)(jnp.stack([k, 2 * k]))[0],
+    "grad": jax.grad,
+    "jacfwd": jax.jacfwd,
+}
+NESTED = [*itertools.permutations(("jit", "vmap", "grad")), ("jacfwd", "vmap", "jit"), ("vmap", "jacfwd", "jit")]
+
+
+@functools.cache
+def slope():
+    return jax.grad(by_args)(1.1)
+
+
+@pytest.mark.parametrize("names", NESTED, ids=" of ".join)
+def test_transformations_in_any_order(names):
+    fn = CAPTURED["closure"]
+    for name in reversed(names):
+        fn = TRANSFORMATIONS[name](fn)
+    np.testing.assert_allclose(fn(1.1), slope(), rtol=1e-13)
+
+
+@pytest.mark.parametrize("solver", [dae_jax.RadauIIA5(), diffrax.Tsit5()], ids=["residuals", "selected states"])
+def test_other_forms_of_the_equations(solver):
+    def swing(k, closes):
+        force = (lambda t, q, v, args: k * GRAVITY) if closes else (lambda t, q, v, k: k * GRAVITY)
+        formulation = None if isinstance(solver, dae_jax.RadauIIA5) else dae_jax.DummyDerivatives()
+        return last_angle(force, k, solver, formulation=formulation)
+
+    one, other = (jax.jit(functools.partial(swing, closes=closes))(1.1) for closes in (True, False))
+    np.testing.assert_allclose(one, other, rtol=1e-14)
+
+
+def test_conditions_of_events():
+    def passes(k, closes):
+        condition = lambda t, y, args, **_: y[0][0] - (0.9 * k if closes else 0.9 * args)
+        event = diffrax.Event(condition, optimistix.Newton(1e-10, 1e-10))
+        return last_angle(lambda t, q, v, args: GRAVITY, k, event=event)
+
+    one, other = (jax.jit(functools.partial(passes, closes=closes))(1.1) for closes in (True, False))
+    np.testing.assert_allclose([one, other], -np.arccos(0.99), rtol=1e-6)
+
+
+def test_a_number_out_of_sight_is_named():
+    class Weight:
+        def __init__(self, k):
+            self.k = k
+
+        def force(self, t, q, v, args):
+            return self.k * GRAVITY
+
+    with pytest.raises(TypeError, match=r"Hand it over through `args`"):
+        jax.grad(lambda k: last_angle(Weight(k).force))(1.1)
+    assert np.isfinite(jax.jit(lambda k: last_angle(Weight(k).force))(1.1))
