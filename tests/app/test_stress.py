@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,9 +11,13 @@ from benchmarks.stress import growth, page
 from benchmarks.stress.cases import Case
 from benchmarks.stress.families import FAMILIES, cases_of
 from benchmarks.stress.judge import judged
+from benchmarks.stress.record import Record
 from benchmarks.stress.runner import run
 from benchmarks.stress.solve import Outcome, solved
 from dae_jax.app.cli import main
+
+
+NOTEBOOKS = Path(__file__).parents[2] / "notebooks"
 
 
 def test_the_command_writes_table_page_and_map(tmp_path, capsys):
@@ -100,6 +105,16 @@ def test_truths_begin_at_the_start(family):
             rounding = 1e4 * np.finfo(found.y0[0].dtype).eps
             for x, e, size in zip(found.y0, found.truth(np.array([0.0, found.t1 / 8])), found.size, strict=True):
                 np.testing.assert_allclose(x / size, e[0] / size, rtol=0, atol=rounding + 2 * found.off)
+
+
+def test_the_page_of_the_repository_is_that_of_its_table(tmp_path):
+    """And has all cells that there are."""
+    record = Record.read(NOTEBOOKS)
+    page.write(record, tmp_path)
+    assert (tmp_path / page.PAGE).read_text() == (NOTEBOOKS / page.PAGE).read_text()
+    assert "Not measured" not in (NOTEBOOKS / page.PAGE).read_text()
+    for name in (page.MAP, *record.figures):
+        assert (NOTEBOOKS / name).stat().st_size > 10_000
 
 
 def test_counts_are_those_of_the_cells():

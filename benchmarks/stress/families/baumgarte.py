@@ -145,7 +145,7 @@ def draw(values, theory, found, ratio):
     )
     for axes, (x, label, style) in zip(shown.subplots(1, 2), panels, strict=True):
         mesh = axes.pcolormesh(edges, edges, spread(x).T, rasterized=True, **style)
-        shown.colorbar(mesh, ax=axes, label=label, shrink=0.9)
+        shown.colorbar(mesh, ax=axes, label=label, shrink=0.75)
         axes.plot([-0.3, 6], [-0.3, 6], color="white" if x is found else "#3A3F45", linewidth=0.8, linestyle=":")
         ticks = [-0.9, 0, 2, 4, 6]
         names = ["0", "1", "10²", "10⁴", "10⁶"]

@@ -1,5 +1,6 @@
 """A pendulum released from the horizontal for a long time, against elliptic functions: how errors, drift and energy grow.
-A tolerance is for a step, and errors add up: here an answer is degraded until it is as far off as the motion is large.
+A tolerance is for a step, and errors add up: here an answer is degraded until it is as far off as the motion is large. No method can
+see its phase go.
 """
 
 import numpy as np

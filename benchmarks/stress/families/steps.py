@@ -1,6 +1,7 @@
 """Fixed steps below, at and over the limit of stability: a spring along a straight line, 5,000 steps of h with hω at 0.95, 1.05 and 2
 of the largest for which |R(ihω)|^5000 ≤ 2, R the method's stability function; without such a limit hω = 1, 10 and 1,000.
-Below the answer must be bounded, above it must not pass for one.
+Below the answer must be bounded, above it must not pass for one. Fixed steps have no error control: what overflows, or leaves the
+manifold, is found. Tsit5 grows slowly over its limit, by 2.7 % a step at twice of it, which no single step shows.
 """
 
 import diffrax
