@@ -18,7 +18,7 @@ from .worker import FULL
 
 ROOT = Path(__file__).parents[2]
 # Seconds of processor time for a cell, compilation included; of time on the clock so many times that, and for the worker to start.
-LIMIT, PATIENCE, START = 30, 10, 60
+LIMIT, PATIENCE, START = 60, 10, 60
 # GiB for a worker.
 MEMORY = 4
 
