@@ -19,13 +19,14 @@ SAVEATS = {
 }
 
 
-def loss(x, saveat, solver, dt0, t0=0.1, t1=1.0):
+def loss(x, saveat, solver, dt0, t0=0.1, t1=1.0, form=None):
     """Of the angle of the start, gravity, both times and a factor on the times saved at."""
     angle, gravity, start, end, factor = x
     system = dae_jax.ConstrainedSystem(lambda t, q, v, g: jnp.stack([0 * g, g]), SCENE.system.constraint)
     y0 = (jnp.stack([jnp.sin(angle), jnp.cos(angle)]), jnp.stack([jnp.cos(angle), -jnp.sin(angle)]))
     sol = dae_jax.daesolve(
-        system, solver, start * t0, end * t1, dt0, y0, gravity, saveat=SAVEATS[saveat](factor), max_steps=200, throw=False
+        system, solver, start * t0, end * t1, dt0, y0, gravity, saveat=SAVEATS[saveat](factor), max_steps=200, throw=False,
+        formulation=form,
     )  # fmt: skip
     leaves = [jnp.sum(jnp.sin(3 * leaf)) for leaf in jax.tree.leaves((sol.ys, sol.ts, sol.t1))]
     return sum(leaves)
@@ -36,17 +37,24 @@ SOLVERS = {
     "Tsit5": diffrax.Tsit5(),
     "projection": dae_jax.OrthogonalProjection(dae_jax.DOP853()),
     "tangent": dae_jax.TangentSpace(diffrax.Tsit5()),
+    "radau": dae_jax.RadauIIA5(),
+    "bdf": dae_jax.BDF(),
+    "selected states": diffrax.Tsit5(),
 }
 # Each solver, each kind of step and each kind of output.
 CASES = [("Tsit5", "t1", "backwards"), ("projection", "t0, ts, t1", "adaptive"), ("tangent", "ts, fn", "fixed")]
+CASES += [("radau", "t0, ts, t1", "adaptive"), ("bdf", "ts, fn", "backwards"), ("bdf", "t0, ts, t1", "adaptive")]
+CASES += [("selected states", "t1", "fixed")]
 
 
 @pytest.mark.parametrize(("solver", "saveat", "steps"), CASES)
 def test_equals_diffrax_with_respect_to_everything(solver, saveat, steps):
-    solver, dt0 = SOLVERS[solver], STEPS[steps]
+    dt0 = STEPS[steps]
     times = (1.0, 0.1) if steps == "backwards" else (0.0, 1.0)
     x = jnp.array([1.2, 9.81, 1.0, 1.0, 1.0])
-    gradient = jax.grad(lambda x: loss(x, saveat, solver, dt0, *times))
+    form = dae_jax.DummyDerivatives() if solver == "selected states" else None
+    solver = SOLVERS[solver]
+    gradient = jax.grad(lambda x: loss(x, saveat, solver, dt0, *times, form))
     taped = gradient(x)
     with dae_jax.configure(one_kernel=False):
         expected = gradient(x)
