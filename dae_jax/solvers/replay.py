@@ -17,6 +17,8 @@ class Replayable:
         """The history that the step with this dense output left."""
         return ()
 
-    def replay(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, history: Any, dense: Any) -> tuple[Any, Any, Any]:
+    def replay(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, history: Any, dense: Any
+    ) -> tuple[Any, Any, Any]:
         """(y₁, history, dense output) of the step with this dense output, with their derivatives."""
         raise NotImplementedError
