@@ -1,5 +1,6 @@
 """Radau IIA with three, five and seven stages for 0 = F(t, y, ẏ)."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -65,6 +66,17 @@ def _along(z: Float[Array, "s n"], x: Any) -> Float[Array, " n"]:
 def _combined(a: Any, x: Any) -> list[Any]:
     """A x for a matrix of numbers and the rows of x, written out."""
     return [sum(float(c) * x[k] for k, c in enumerate(row)) for row in a]
+
+
+def _looped(fn: Callable[[Any], Any], items: list[Any]) -> list[Any]:
+    """fn of each, compiled at one place."""
+    found = lax.map(fn, jax.tree.map(lambda *x: jnp.stack(x), *items))
+    return [jax.tree.map(lambda x, i=i: x[i], found) for i in range(len(items))]
+
+
+def _of_pairs(fn: Callable[[Any], Any], pairs: list[Any]) -> list[Any]:
+    """fn for each pair of stages: the elimination is the larger part of what there is to compile."""
+    return [fn(pairs[0])] if len(pairs) == 1 else _looped(fn, pairs)
 
 
 class _State(NamedTuple):
@@ -135,8 +147,7 @@ class _Step(NamedTuple):
         stages = self.stages(z)
         if not is_large(fn, *stages[0]):
             return [fn(*stage) for stage in stages]
-        found = lax.map(lambda stage: fn(*stage), jax.tree.map(lambda *x: jnp.stack(x), *stages))
-        return [jax.tree.map(lambda x, i=i: x[i], found) for i in range(len(stages))]
+        return _looped(lambda stage: fn(*stage), stages)
 
     def residuals(self, z: Float[Array, "s n"]) -> Float[Array, "s n"]:
         """F at the stages."""
@@ -151,22 +162,18 @@ class _Step(NamedTuple):
         """The factors of γ/h M + J, in the smallest step of M/h + J, and of each (αₖ + iβₖ)/h M + J, and the smallest pivot."""
         j, m = jacobians
         real, pivot = self.linearised.factor(j, m, jnp.where(self.smallest, 1, self.method.gamma) / self.h, self.h)
-        both = []
-        for pair in self.method.pairs:
-            factors, other = self.linearised.factor(j, m, lax.complex(pair.real / self.h, pair.imag / self.h), self.h)
-            both, pivot = [*both, factors], jnp.minimum(pivot, other)
+        pairs = [lax.complex(pair.real / self.h, pair.imag / self.h) for pair in self.method.pairs]
+        both, others = zip(*_of_pairs(lambda c: self.linearised.factor(j, m, c, self.h), pairs), strict=True)
         round_off = tol.round_off(self.linearised, j, m, 1 / self.h, self.y0)
-        return _Factors(real, tuple(both), round_off), pivot
+        return _Factors(real, both, round_off), functools.reduce(jnp.minimum, others, pivot)
 
     def correction(self, factors: _Factors, residuals: Float[Array, "s n"]) -> Float[Array, "s n"]:
         """Δz of simplified Newton, decoupled into a real and (s − 1)/2 complex systems."""
         first, *others = _combined(self.method.back, residuals)
         w = self.linearised.solve(factors.real, jnp.where(self.smallest, residuals[-1], first))
-        decoupled = [w]
-        for both, real, imaginary in zip(factors.complex, others[::2], others[1::2], strict=True):
-            v = self.linearised.solve(both, lax.complex(real, imaginary))
-            decoupled += [jnp.real(v), jnp.imag(v)]
-        stages = _combined(self.method.transform, decoupled)
+        pairs = zip(factors.complex, map(lax.complex, others[::2], others[1::2]), strict=True)
+        found = _of_pairs(lambda pair: self.linearised.solve(*pair), list(pairs))
+        stages = _combined(self.method.transform, [w, *(part for v in found for part in (jnp.real(v), jnp.imag(v)))])
         return -jnp.stack([jnp.where(self.smallest, w, stage) for stage in stages])
 
 
@@ -232,7 +239,7 @@ class AbstractRadauIIA(AbstractResidualSolver):
         scaled = counted = _error(*constant((step, factors.real, z)), tol) * args.weights(step.h)
         if args.between(self.dense).any():
             weights = args.weights(step.h, tol.raised()) * args.between(self.dense)
-            between = _between(*constant((step, state, z))) * weights
+            between = _between(step.method, *constant((state, step.h, z))) * weights
             counted = jnp.where(jnp.abs(between) > jnp.abs(scaled), between, scaled)
         rates, smallest = step.stages(z)[-1][2], step.smallest
         # What is algebraic may jump in the smallest step.
@@ -385,15 +392,15 @@ def _error(step: _Step, factor: Any, z: Any, tol: Tolerances) -> Float[Array, " 
     return lax.while_loop(again, estimate, (0, jnp.zeros_like(step.y0), jnp.zeros_like(step.h)))[1]
 
 
-def _between(step: _Step, state: _State, z: Any) -> Float[Array, " n"]:
+def _between(method: Coefficients, state: _State, h: Any, z: Any) -> Float[Array, " n"]:
     """The largest error of the polynomial through the step's points, by the start of the step before."""
     # 1 where there was none, which is as good as any.
-    before = reach = -jnp.where(state.h == 0, 1, state.h / step.h)
-    for c in step.method.nodes:
+    before = reach = -jnp.where(state.h == 0, 1, state.h / h)
+    for c in method.nodes:
         reach = reach * (before - float(c))
     off = _along(z, before) + state.z[-1]
-    at_start = sum(float(c) * z[i] for i, c in enumerate(step.method.at_start))
-    return jnp.where(state.h == 0, at_start, off * (step.method.between / reach))
+    at_start = sum(float(c) * z[i] for i, c in enumerate(method.at_start))
+    return jnp.where(state.h == 0, at_start, off * (method.between / reach))
 
 
 def _coupled(step: _Step, z: Float[Array, "s n"]) -> Any:
