@@ -1,20 +1,17 @@
 """Radau IIA with three, five and seven stages for 0 = F(t, y, ẏ)."""
 
-import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from ..compiler import is_large
 from ..linalg import implicit_root
 from .manifold import time_sign
 from .radau_coefficients import Coefficients, coefficients
+from .radau_step import CollocationPolynomial, Step, along, coupled, linear_solve
 from .residual_steps import (
     AbstractResidualSolver,
     Iteration,
@@ -23,7 +20,6 @@ from .residual_steps import (
     constant,
     corrected,
     goes_on,
-    is_smallest,
     not_begun,
     of_step,
     passes_a_kink,
@@ -37,46 +33,6 @@ from .residual_steps import (
 FAST = 1e-2
 # As many more corrections for each stage more than three (the program RADAU).
 PATIENCE = 2.5
-
-
-class CollocationPolynomial(diffrax.AbstractLocalInterpolation):
-    """The polynomial of degree s through the step's start and its s stages y₀ + zᵢ."""
-
-    t0: Any
-    t1: Any
-    y0: Any
-    z: Any
-
-    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Any:
-        """The value at `t0`, or the increment from there to `t1`."""
-        if t1 is not None:
-            return self.evaluate(t1) - self.evaluate(t0)
-        h = self.t1 - self.t0
-        # After a jump in time diffrax asks for a point that is before the step by round-off.
-        return self.y0 + _along(self.z, jnp.clip((t0 - self.t0) / jnp.where(h == 0, 1, h), 0, 1))
-
-
-def _along(z: Float[Array, "s n"], x: Any) -> Float[Array, " n"]:
-    *lower, value = _combined(coefficients(len(z)).polynomial, z)
-    for c in reversed(lower):
-        value = c + x * value
-    return x * value
-
-
-def _combined(a: Any, x: Any) -> list[Any]:
-    """A x for a matrix of numbers and the rows of x, written out."""
-    return [sum(float(c) * x[k] for k, c in enumerate(row)) for row in a]
-
-
-def _looped(fn: Callable[[Any], Any], items: list[Any]) -> list[Any]:
-    """fn of each, compiled at one place."""
-    found = lax.map(fn, jax.tree.map(lambda *x: jnp.stack(x), *items))
-    return [jax.tree.map(lambda x, i=i: x[i], found) for i in range(len(items))]
-
-
-def _of_pairs(fn: Callable[[Any], Any], pairs: list[Any]) -> list[Any]:
-    """fn for each pair of stages: the elimination is the larger part of what there is to compile."""
-    return [fn(pairs[0])] if len(pairs) == 1 else _looped(fn, pairs)
 
 
 class _State(NamedTuple):
@@ -95,86 +51,6 @@ class _State(NamedTuple):
     factored: Float[Array, ""]
     refresh: Bool[Array, ""]
     eta: Float[Array, ""]
-
-
-class _Factors(NamedTuple):
-    """The factors of the `real` and the `complex` iteration matrices, and what may be `round_off` of each equation."""
-
-    real: Any
-    complex: tuple[Any, ...]
-    round_off: Float[Array, " n"]
-
-
-class _Step(NamedTuple):
-    """The equations of a step: a pytree, so that they can be differentiated.
-
-    In the smallest step that time resolves all stages are one, that of the implicit Euler method: where a variable
-    jumps, equations of both sides of the jump need have no solution together, those of one side have.
-    """
-
-    method: Coefficients
-    linearised: Any
-    sign: Any
-    t0: Any
-    t1: Any
-    y0: Float[Array, " n"]
-
-    @property
-    def smallest(self) -> Any:
-        """Whether time resolves no smaller step."""
-        return is_smallest(self.t0, self.t1)
-
-    @property
-    def rates(self) -> Float[Array, "s s"]:
-        """h times ẏ at the stages by zⱼ."""
-        inverse = jnp.asarray(self.method.inverse, self.y0.dtype)
-        return jnp.where(self.smallest, jnp.eye(self.method.stages, dtype=inverse.dtype), inverse)
-
-    @property
-    def h(self) -> Any:
-        # A lane of a batch that has ended goes on with steps of length 0, whose derivatives are multiplied by 0.
-        return jnp.where(self.t1 == self.t0, 1, self.t1 - self.t0)
-
-    def stages(self, z: Float[Array, "s n"]) -> Any:
-        """(tᵢ, Yᵢ, ẏ at tᵢ) of each stage."""
-        rates = [jnp.where(self.smallest, z[i], rate) for i, rate in enumerate(_combined(self.method.inverse, z))]
-        inner = [jnp.where(self.smallest, self.t1, self.t0 + float(c) * self.h) for c in self.method.nodes[:-1]]
-        times = [*inner, self.t1]
-        return [(self.sign * t, self.y0 + z[i], rates[i] * (self.sign / self.h)) for i, t in enumerate(times)]
-
-    def at_stages(self, fn: Callable[..., Any], z: Float[Array, "s n"]) -> list[Any]:
-        """fn(t, y, ẏ) at each stage: in a loop where it is large."""
-        stages = self.stages(z)
-        if not is_large(fn, *stages[0]):
-            return [fn(*stage) for stage in stages]
-        return _looped(lambda stage: fn(*stage), stages)
-
-    def residuals(self, z: Float[Array, "s n"]) -> Float[Array, "s n"]:
-        """F at the stages."""
-        return jnp.stack(self.at_stages(self.linearised.residual, z))
-
-    def jacobians(self, t: Any, y: Any, yd: Any) -> tuple[Any, Any]:
-        """∂F/∂y and ∂F/∂(dy/dτ) for the loop's own time τ = ± t."""
-        j, m = self.linearised.jacobians(t, y, yd)
-        return j, self.sign * m
-
-    def factor(self, jacobians: Any, tol: Tolerances) -> tuple[_Factors, Float[Array, ""]]:
-        """The factors of γ/h M + J, in the smallest step of M/h + J, and of each (αₖ + iβₖ)/h M + J, and the smallest pivot."""
-        j, m = jacobians
-        real, pivot = self.linearised.factor(j, m, jnp.where(self.smallest, 1, self.method.gamma) / self.h, self.h)
-        pairs = [lax.complex(pair.real / self.h, pair.imag / self.h) for pair in self.method.pairs]
-        both, others = zip(*_of_pairs(lambda c: self.linearised.factor(j, m, c, self.h), pairs), strict=True)
-        round_off = tol.round_off(self.linearised, j, m, 1 / self.h, self.y0)
-        return _Factors(real, both, round_off), functools.reduce(jnp.minimum, others, pivot)
-
-    def correction(self, factors: _Factors, residuals: Float[Array, "s n"]) -> Float[Array, "s n"]:
-        """Δz of simplified Newton, decoupled into a real and (s − 1)/2 complex systems."""
-        first, *others = _combined(self.method.back, residuals)
-        w = self.linearised.solve(factors.real, jnp.where(self.smallest, residuals[-1], first))
-        pairs = zip(factors.complex, map(lax.complex, others[::2], others[1::2]), strict=True)
-        found = _of_pairs(lambda pair: self.linearised.solve(*pair), list(pairs))
-        stages = _combined(self.method.transform, [w, *(part for v in found for part in (jnp.real(v), jnp.imag(v)))])
-        return -jnp.stack([jnp.where(self.smallest, w, stage) for stage in stages])
 
 
 class AbstractRadauIIA(AbstractResidualSolver):
@@ -201,7 +77,7 @@ class AbstractRadauIIA(AbstractResidualSolver):
     def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> _State:
         sign = time_sign(terms, t0, t1)
         zero = jnp.zeros((), y0.dtype)
-        step = _Step(coefficients(self.stages), args, sign, t0, t1, y0)
+        step = Step(coefficients(self.stages), args, sign, t0, t1, y0)
         tol = self._tolerances(y0.dtype)
         unused = jax.eval_shape(lambda: (j := step.jacobians(t0, y0, y0), step.factor(j, tol)[0]))
         jacobians, factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), unused)
@@ -223,7 +99,7 @@ class AbstractRadauIIA(AbstractResidualSolver):
         state = solver_state._replace(
             refresh=solver_state.refresh | made_jump, h=jnp.where(made_jump, 0, solver_state.h)
         )
-        step = _Step(coefficients(self.stages), args, time_sign(terms, t0, t1), t0, t1, y0)
+        step = Step(coefficients(self.stages), args, time_sign(terms, t0, t1), t0, t1, y0)
         tol = self._tolerances(y0.dtype)
         # The unknowns of a stage are interleaved, so that a band stays one.
         apart = lambda z: z.reshape(-1, self.stages).T
@@ -231,8 +107,8 @@ class AbstractRadauIIA(AbstractResidualSolver):
             lambda z, params: params[0].residuals(apart(z)).T.reshape(-1),
             lambda params: _solve(*params),
             (step, constant(state), tol),
-            linear_solve=_linear_solve,
-            jacobian=lambda z, params: _coupled(params[0], apart(z)),
+            linear_solve=linear_solve,
+            jacobian=lambda z, params: coupled(params[0], apart(z)),
         )
         z = apart(flat)
         y1 = y0 + z[-1]
@@ -328,11 +204,11 @@ class RadauIIA13(AbstractRadauIIA):
 def _predicted(state: _State, h: Any) -> Float[Array, "s n"]:
     """The stages on the last step's polynomial; 0 without one."""
     ratio = h / jnp.where(state.h == 0, 1, state.h)
-    ahead = jnp.stack([_along(state.z, 1 + float(c) * ratio) - state.z[-1] for c in coefficients(len(state.z)).nodes])
+    ahead = jnp.stack([along(state.z, 1 + float(c) * ratio) - state.z[-1] for c in coefficients(len(state.z)).nodes])
     return jnp.where(state.h == 0, 0, ahead)
 
 
-def _solve(step: _Step, state: _State, tol: Tolerances) -> Any:
+def _solve(step: Step, state: _State, tol: Tolerances) -> Any:
     """The stages, and how they were found: with the Jacobian at hand first, with new ones where these fail, and in the
     smallest step with new ones for each correction.
     """
@@ -376,7 +252,7 @@ def _solve(step: _Step, state: _State, tol: Tolerances) -> Any:
     return z.T.reshape(-1), (found, jacobians, factors, pivot)
 
 
-def _error(step: _Step, factor: Any, z: Any, tol: Tolerances) -> Float[Array, " n"]:
+def _error(step: Step, factor: Any, z: Any, tol: Tolerances) -> Float[Array, " n"]:
     """−(γ/h M + J)⁻¹ F(t₀, y₀, −Σ eᵢ zᵢ/h), once more from y₀ + error where that is large (eqs. IV.8.19, IV.8.20)."""
     rate = sum(float(e) * z[i] for i, e in enumerate(step.method.error)) * (-step.sign / step.h)
 
@@ -398,19 +274,6 @@ def _between(method: Coefficients, state: _State, h: Any, z: Any) -> Float[Array
     before = reach = -jnp.where(state.h == 0, 1, state.h / h)
     for c in method.nodes:
         reach = reach * (before - float(c))
-    off = _along(z, before) + state.z[-1]
+    off = along(z, before) + state.z[-1]
     at_start = sum(float(c) * z[i] for i, c in enumerate(method.at_start))
     return jnp.where(state.h == 0, at_start, off * (method.between / reach))
-
-
-def _coupled(step: _Step, z: Float[Array, "s n"]) -> Any:
-    """The Jacobian of all stages at the solution, in the storage of their unknowns interleaved."""
-    found = step.at_stages(step.jacobians, z)
-    storage, matrix = step.linearised.storage.coupled([j for j, _ in found], [m for _, m in found], step.rates / step.h)
-    return storage, matrix, jnp.repeat(step.linearised.column_scale(step.h), step.method.stages)
-
-
-def _linear_solve(jacobian: Any, b: Float[Array, " sn"]) -> Float[Array, " sn"]:
-    storage, matrix, scale = jacobian
-    factors, _ = storage.factor(storage.scale_columns(matrix, scale))
-    return scale * storage.solve(factors, b)
