@@ -33,6 +33,8 @@ from .residual_steps import (
 FAST = 1e-2
 # As many more corrections for each stage more than three (the program RADAU).
 PATIENCE = 2.5
+# By which diffrax lets a step grow at most.
+GROWTH = 10
 
 
 class _State(NamedTuple):
@@ -202,10 +204,14 @@ class RadauIIA13(AbstractRadauIIA):
 
 
 def _predicted(state: _State, h: Any) -> Float[Array, "s n"]:
-    """The stages on the last step's polynomial; 0 without one."""
+    """The stages on the last step's polynomial; 0 without one, or where it does not reach."""
+    method = coefficients(len(state.z))
     ratio = h / jnp.where(state.h == 0, 1, state.h)
-    ahead = jnp.stack([along(state.z, 1 + float(c) * ratio) - state.z[-1] for c in coefficients(len(state.z)).nodes])
-    return jnp.where(state.h == 0, 0, ahead)
+    ahead = jnp.stack([along(state.z, 1 + float(c) * ratio) - state.z[-1] for c in method.nodes])
+    none = state.h == 0
+    if method.reach < GROWTH:
+        none = none | (ratio > method.reach)
+    return jnp.where(none, 0, ahead)
 
 
 def _solve(step: Step, state: _State, tol: Tolerances) -> Any:

@@ -13,6 +13,10 @@ import numpy as np
 from jaxtyping import Float
 
 
+# How much larger errors of the stages may become where a step's polynomial is continued into the next.
+AMPLIFIED = 5e5
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Coefficients:
     """Of the method with s stages, whose collocation polynomial z(s) is 0 at 0 and zᵢ at the nodes cᵢ.
@@ -21,7 +25,8 @@ class Coefficients:
     `at_start`: the value at 0 of the polynomial through the stages alone. T⁻¹ A⁻¹ T has the blocks `gamma` and
     [[αₖ, −βₖ], [βₖ, αₖ]], one of αₖ + iβₖ in `pairs` each; `transform` is T, `back` T⁻¹. `error`: the embedded formula of
     order s, ŷ₁ − y₁ = γ₀ (h ẏ₀ + Σ eᵢ zᵢ) with γ₀ = 1/`gamma`, for which −Σ eᵢ zᵢ is z'(0) (eq. IV.8.19). `between`: the
-    largest value of |s (s − c₁) … (s − 1)| in a step.
+    largest value of |s (s − c₁) … (s − 1)| in a step. `reach`: how many times as long as the last a step may be for the
+    polynomial to be continued into it: to where it multiplies errors of the stages by `AMPLIFIED`.
     """
 
     nodes: Float[np.ndarray, " s"]
@@ -35,6 +40,7 @@ class Coefficients:
     back: Float[np.ndarray, "s s"]
     error: Float[np.ndarray, " s"]
     between: float
+    reach: float
 
     @property
     def stages(self) -> int:
@@ -67,7 +73,14 @@ def coefficients(stages: int) -> Coefficients:
         back=np.linalg.inv(transform),
         error=-polynomial[0],
         between=float(np.abs(places * np.prod(places[:, None] - nodes, 1)).max()),
+        reach=_reach(polynomial),
     )
+
+
+def _reach(polynomial: Float[np.ndarray, "s s"]) -> float:
+    ahead = np.linspace(0, 20, 2001)
+    powers = (1 + ahead[:, None]) ** np.arange(1, len(polynomial) + 1)
+    return float(ahead[np.abs(powers @ polynomial).sum(1) <= AMPLIFIED][-1])
 
 
 def _nodes(stages: int) -> Float[np.ndarray, " s"]:

@@ -156,6 +156,14 @@ class TestRadau:
         expected = cubic(h + new * method.nodes) - cubic(h)
         np.testing.assert_allclose(radau._predicted(last, new)[:, 0], expected, rtol=1e-11, atol=1e-11)
 
+    def test_a_polynomial_of_high_degree_is_not_continued_far(self, method):
+        """By three stages into any step that diffrax makes next; by more where noise stays noise."""
+        noise = np.where(np.arange(method.stages) % 2, 1e-12, -1e-12)[:, None]
+        last = radau._State(jnp.asarray(noise), jnp.asarray(1.0), *[None] * 6)
+        ahead = [np.abs(radau._predicted(last, jnp.asarray(ratio))).max() for ratio in (0.5, 1.2, 10.0)]
+        assert max(ahead) < 1e-6
+        assert (np.array(ahead) > 0).tolist() == [True, True, method.stages == 3]
+
     def test_what_the_start_of_the_step_before_says_of_the_way_between(self, method):
         """All of the error for a power one higher than the polynomial takes."""
         s, h, before = method.stages, 0.5, 0.8
