@@ -32,8 +32,7 @@ OSCILLATORS = {
 }
 
 
-@pytest.mark.parametrize("kind", OSCILLATORS)
-@BOTH
+@pytest.mark.parametrize(("solver", "kind"), [(NINE, "index 1"), (THIRTEEN, "ODE"), (THIRTEEN, "index 1")])
 def test_order_on_an_ode_and_on_index_one(solver, kind):
     system, end = dae_jax.ImplicitDAE(OSCILLATORS[kind]), 24.0
     exact = np.array([np.sin(end), np.cos(end), np.cos(end)])
@@ -108,19 +107,17 @@ def reaction(k):
 
 
 def test_gradients_and_a_batch():
-    def end(k, adjoint, rtol):
+    def end(k, adjoint):
         system, y0, rates = reaction(k)
-        return adaptive(system, NINE, 40.0, y0, rtol, 1e-4 * rtol, rates, adjoint=adjoint, max_steps=1000).ys[1][-1, 0]
+        return adaptive(system, NINE, 40.0, y0, 1e-9, 1e-13, rates, adjoint=adjoint, max_steps=1000).ys[1][-1, 0]
 
     reverse, forward = diffrax.RecursiveCheckpointAdjoint(), diffrax.ForwardMode()
-    k, h = jnp.array([1.0, 1.1, 0.9]), 1e-4
-    ends = jnp.concatenate([k + h * jnp.eye(3), k - h * jnp.eye(3)])
-    together = jax.vmap(lambda k: end(k, reverse, 1e-10))(ends)
-    alone = jnp.stack([end(k, reverse, 1e-10) for k in ends[:2]])
-    np.testing.assert_allclose(together[:2], alone, rtol=1e-12)
-    found = jax.grad(lambda k: end(k, reverse, 1e-7))(k)
-    np.testing.assert_allclose(found, jax.jacfwd(lambda k: end(k, forward, 1e-7))(k), rtol=1e-8)
-    np.testing.assert_allclose(found, (together[:3] - together[3:]) / (2 * h), rtol=1e-5)
+    k, along, h = jnp.array([1.0, 1.1, 0.9]), jnp.array([0.3, -0.5, 1.0]), 1e-4
+    batch = jax.vmap(lambda k: end(k, reverse))(jnp.stack([k, k + h * along, k - h * along]))
+    value, change = jax.jvp(lambda k: end(k, forward), (k,), (along,))
+    np.testing.assert_allclose(batch[0], value, rtol=1e-12)
+    np.testing.assert_allclose(jax.grad(lambda k: end(k, reverse))(k) @ along, change, rtol=1e-8)
+    np.testing.assert_allclose(change, (batch[1] - batch[2]) / (2 * h), rtol=1e-5)
 
 
 def test_float32_and_backwards():
