@@ -61,8 +61,10 @@ class Violation(eqx.Module):
 def violation(ode: MechanicalODE, t: Time, y: Phase) -> Violation:
     """How far the flat state y = (q, v) is from the manifold."""
     q, v = y
-    root = jnp.finfo(q.dtype).eps ** 0.5
-    of_q, of_v = (root * (1 + jnp.max(jnp.abs(x))) for x in (q, v))
+    eps = jnp.finfo(q.dtype).eps
+    of_q, of_v = (eps**0.5 * (1 + jnp.max(jnp.abs(x))) for x in (q, v))
+    # A mechanism of micrometres: what is more than a part of itself off is no round-off, whatever the unit.
+    of_q = jnp.minimum(of_q, jnp.maximum(eps**0.25 * jnp.max(jnp.abs(q)), 1e4 * eps))
     return Violation(ode.invariants(t, y), ode.distances(t, y), (of_q, of_v))
 
 

@@ -177,15 +177,14 @@ def _run_on_numbers(program: Program, arrays: Arrays, solve: Solve, problem: Pro
     is not all of them.
     """
     refuse_bad_times(solve.saveat, problem.t0, problem.t1)
-    known = _of_known_rank.get(program, program)
+    known = _of_known_rank.get(program)
+    if known is None:
+        known = _with_rank(program, solve, problem) if solve.formulation.counts_constraints else program
     sol, as_expected, seconds = run(known, arrays)
     # Inside an outer `jit` the result is no number, although the inputs are: they are looked at each time it is traced.
     inside = isinstance(as_expected, Tracer)
     if inside or not as_expected:
-        with jax.ensure_compile_time_eval():
-            rank = refuse_bad_start(*problem.start, solve.formulation.inverts_mass)
-        better, _ = split((solve, dataclasses.replace(problem, rank=rank)))
-        _remember(program, better)
+        better = _with_rank(program, solve, problem)
         if better != known:
             sol, _, more = run(better, arrays)
             seconds += more
@@ -194,10 +193,15 @@ def _run_on_numbers(program: Program, arrays: Arrays, solve: Solve, problem: Pro
     return sol
 
 
-def _remember(program: Program, better: Program) -> None:
+def _with_rank(program: Program, solve: Solve, problem: Problem) -> Program:
+    """The program for the number of constraints that are independent at the start; it is remembered."""
+    with jax.ensure_compile_time_eval():
+        rank = refuse_bad_start(*problem.start, solve.formulation.inverts_mass)
+    better, _ = split((solve, dataclasses.replace(problem, rank=rank)))
     _of_known_rank[program] = better
     for oldest in list(_of_known_rank)[:-KEPT]:
         _of_known_rank.pop(oldest, None)
+    return better
 
 
 def _default_controller(dt0: Time | None, dtype: DType) -> diffrax.AbstractStepSizeController:

@@ -52,9 +52,16 @@ def _main(argv: list[str] | None) -> int:
     bench = commands.add_parser(
         "bench", help="run the benchmarks of a source checkout; `bench --help` lists them", add_help=False
     )
+    stress = commands.add_parser(
+        "stress",
+        help="a table of what each method can take, from a source checkout; see `stress --help`",
+        add_help=False,
+    )
     arguments, rest = parser.parse_known_args(argv)
     if arguments.command == "bench":
-        return _bench(bench, rest)
+        return _of_a_checkout(bench, "benchmarks", rest)
+    if arguments.command == "stress":
+        return _of_a_checkout(stress, "benchmarks.stress", rest)
     parser = commands.choices[arguments.command]
     if rest:
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
@@ -259,11 +266,11 @@ def _tune(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> int
     return 0
 
 
-def _bench(parser: argparse.ArgumentParser, arguments: list[str]) -> int:
+def _of_a_checkout(parser: argparse.ArgumentParser, package: str, arguments: list[str]) -> int:
     root = Path(__file__).parents[2]
-    if (root / "benchmarks" / "__main__.py").exists():
+    if root.joinpath(*package.split("."), "__main__.py").exists():
         sys.path.insert(0, str(root))
-        return importlib.import_module("benchmarks.__main__").main(arguments)
+        return importlib.import_module(f"{package}.__main__").main(arguments)
     absent = "the benchmarks are part of the source repository, not of the installed package; run it from a checkout"
     if {"-h", "--help"} & set(arguments):
         print(f"usage: {parser.prog} [-h] ...\n\n{absent}")

@@ -12,7 +12,7 @@ import optimistix
 
 from ..equations.manifold_ode import Equations, ManifoldODE
 from ..formulations import AbstractFormulation
-from ..linalg import rms_norm
+from ..linalg import error_norm
 from ..solution import RESULTS, Interpolation
 from ..solvers import (
     AbstractManifoldSolver,
@@ -121,7 +121,7 @@ def _fitted(controller: diffrax.AbstractStepSizeController, t0: Time, t1: Time) 
     if type(controller) is not diffrax.PIDController:
         return controller
     if controller.norm is optimistix.rms_norm:
-        controller = dataclasses.replace(controller, norm=rms_norm)
+        controller = dataclasses.replace(controller, norm=error_norm)
     if controller.dtmin is not None:
         return controller
     floor = 16 * jnp.finfo(jnp.result_type(t0)).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))

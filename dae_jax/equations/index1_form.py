@@ -64,9 +64,13 @@ class Index1Form(eqx.Module):
         return jnp.concatenate([y, self.ode.highest(t, y)])
 
     def decode(self, t: Time, z: Float[Array, " z"]) -> Any:
-        """The state in the user's structure."""
-        form = self.ode.form
-        return form.decode(t, take(z, self.ode.orders.places[0][: form.layout.size]))
+        """The state in the user's structure, with H(t, Y) = 0 to round-off: the steps, and more so the values between them, leave
+        a part of the tolerance.
+        """
+        form, y = self.ode.form, z[: self.ode.orders.size]
+        on, found = self.ode.project(t, y)
+        settled = jnp.concatenate([jnp.where(found, on, y), z[y.size :]])
+        return form.decode(t, take(settled, self.ode.orders.places[0][: form.layout.size]))
 
     def known_rates(self, z: Float[Array, " z"]) -> Float[Array, " z"]:
         """What z itself says of ż: the rate of all of Y."""

@@ -293,6 +293,19 @@ class StructuralODE(ManifoldODE):
         keep = present >= HYSTERESIS * quality
         return jnp.where(keep, chosen, best), ~keep
 
+    def orientation(self, t: Time, y: Float[Array, " N"], chosen: Float[Array, "m N"]) -> Float[Array, " levels"]:
+        """The sign, level by level, of the determinant with which H = 0 determines the `chosen` dummy derivatives: it changes
+        only where these become undetermined.
+        """
+        matrix, first, signs = lax.stop_gradient(self._system(t, y, None)[0]), 0, []
+        for k in range(1, max(self.orders.equations) + 1):
+            rows, place = self.orders.rows(k - 1), self.orders.dummies(k)
+            directions = chosen[first : first + len(rows)]
+            columns = jnp.where(jnp.asarray(place >= 0), directions[:, np.maximum(place, 0)], 0)
+            signs.append(jnp.linalg.slogdet(row_products(matrix[rows], columns))[0])
+            first += len(rows)
+        return jnp.stack(signs)
+
     # The user's state
 
     def decode(self, t: Time, y: Float[Array, " N"]) -> Any:

@@ -77,11 +77,13 @@ class Baumgarte(AbstractFieldFormulation):
 
     def __call__(self, *levels: Float[Array, " m"]) -> Any:
         """What is added to the highest derivative of a constraint, given the constraint and its lower derivatives."""
-        polynomial = [jnp.ones((), jnp.result_type(*levels))]
+        dtype = jnp.result_type(*levels)
+        alpha, beta = self.alpha.astype(dtype), self.beta.astype(dtype)
+        polynomial = [jnp.ones((), dtype)]
         for _ in range(len(levels) // 2):
-            polynomial = _product(polynomial, [1.0, 2 * self.alpha, self.beta**2])
+            polynomial = _product(polynomial, [1.0, 2 * alpha, beta**2])
         if len(levels) % 2:
-            polynomial = _product(polynomial, [1.0, self.alpha])
+            polynomial = _product(polynomial, [1.0, alpha])
         return sum(c * level for c, level in zip(polynomial[:0:-1], levels, strict=True))
 
 

@@ -30,12 +30,14 @@ class AbstractFormulation(eqx.Module):
     - `leaves_constraints`: whether there are constraints left that a solver can keep.
     - `selects_states`: whether entries of the state are selected that alone are integrated.
     - `changes_field`: whether the field is another than that of the underlying ODE.
+    - `counts_constraints`: whether the size of the state depends on how many constraints are independent.
     """
 
     inverts_mass: ClassVar[bool] = True
     leaves_constraints: ClassVar[bool] = True
     selects_states: ClassVar[bool] = False
     changes_field: ClassVar[bool] = True
+    counts_constraints: ClassVar[bool] = False
 
     @property
     def name(self) -> str:

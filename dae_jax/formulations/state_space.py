@@ -40,6 +40,7 @@ class StateSpace(AbstractFieldFormulation):
 
     inverts_mass: ClassVar[bool] = False
     leaves_constraints: ClassVar[bool] = False
+    counts_constraints: ClassVar[bool] = True
 
     chart: Callable[..., Any]
     guess: Any = None

@@ -10,6 +10,6 @@ from .newton import (
     relative_change as relative_change,
     roundoff as roundoff,
 )
-from .norm import rms_norm as rms_norm
+from .norm import error_norm as error_norm, rms_norm as rms_norm
 from .semidefinite import semidefinite_solve as semidefinite_solve, smallest_pivot as smallest_pivot
 from .tearing import Tearing as Tearing, tearing as tearing

@@ -15,3 +15,11 @@ def rms_norm(x: PyTree) -> Float[Array, ""]:
         return jnp.zeros(())
     total = sum(jnp.sum(jnp.real(leaf * jnp.conj(leaf))) for leaf in leaves) / sum(leaf.size for leaf in leaves)
     return jnp.sqrt(jnp.where(total == 0, 1, total)) * (total != 0)
+
+
+def error_norm(x: PyTree) -> Float[Array, ""]:
+    """`rms_norm`, infinite where it is not a number: an infinite error as a part of an infinite state, after which the step of
+    `diffrax.PIDController` would not be a number either, and all later ones.
+    """
+    size = rms_norm(x)
+    return jnp.where(jnp.isnan(size), jnp.inf, size)

@@ -68,13 +68,13 @@ class AbstractImplicitSolver(diffrax.AbstractSolver):
 def predictor(tableau: Tableau, terms: diffrax.AbstractTerm, args: Args, t0: Time, t1: Time, y0: Y) -> Any:
     """zᵢ = Yᵢ − y₀ of the implicit stages by explicit Euler."""
     k0, _ = ravel_pytree(vector_field(terms, args, t0, t1)(t0, y0))
-    return jnp.concatenate([tableau.c[i] * k0 for i in tableau.implicit])
+    return jnp.concatenate([float(tableau.c[i]) * k0 for i in tableau.implicit])
 
 
 def vector_field(terms: diffrax.AbstractTerm, args: Args, t0: Time, t1: Time) -> Callable[[Any, Any], Any]:
     """(t, y) ↦ h f(t, y)."""
     control = terms.contr(t0, t1)
-    return lambda t, y: jax.tree.map(lambda x: control * x, terms.vf(t, y, args))
+    return lambda t, y: jax.tree.map(lambda x: jnp.asarray(control, x.dtype) * x, terms.vf(t, y, args))
 
 
 def _stages(

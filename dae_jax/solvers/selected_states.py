@@ -3,12 +3,13 @@
 import dataclasses
 from typing import Any, ClassVar, NamedTuple
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from .chart_steps import AbstractChartSolver
-from .manifold import time_sign
+from .manifold import or_nan, outcome, time_sign
 from .residual_steps import AbstractResidualSolver, constant
 
 
@@ -39,6 +40,12 @@ class SelectedStates(AbstractChartSolver):
         y1, error, dense, derivative, result = self.step_in(
             directions, terms, t0, t1, y0, args, solver_state.inner, made_jump
         )
+        if len(directions):
+            sign = time_sign(terms, t0, t1)
+            before, after = args.orientation(sign * t0, y0, directions), args.orientation(sign * t1, y1, directions)
+            stays = jnp.all(before * after > 0)
+            y1, error = or_nan(stays, y1), None if error is None else or_nan(stays, error)
+            result = diffrax.RESULTS.where(stays, result, outcome(stays))
         return y1, error, dense, Selection(derivative, directions, solver_state.switches + switched), result
 
 

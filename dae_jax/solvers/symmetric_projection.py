@@ -64,9 +64,9 @@ class SymmetricProjection(AbstractManifoldSolver):
         stages = len(tableau.implicit) * flat.size
 
         def residual(x: Flat, params: PyTree) -> Any:
-            terms, args, t0, t1, y0 = params
+            terms, args, t0, t1, y0, lengths = params
             sign = time_sign(terms, t0, t1)
-            z, y1, mu = x[:stages], unravel(x[stages : stages + flat.size]), x[stages + flat.size :]
+            z, y1, mu = x[:stages], unravel(x[stages : stages + flat.size]), x[stages + flat.size :] / lengths
             start = args.displace(y0, args.normals(sign * t0, y0), mu)
             end = stage_end(tableau, terms, args, t0, t1, start, z)
             projected = args.displace(end, args.normals(sign * t1, y1), mu)
@@ -78,10 +78,15 @@ class SymmetricProjection(AbstractManifoldSolver):
                 ]
             )
 
-        params = (terms, args, t0, t1, y0)
-        euler = flat + ravel_pytree(vector_field(terms, args, t0, t1)(t0, y0))[0]
         zero = jnp.zeros(sum(level.size for level in levels), flat.dtype)
-        x, found = newton(residual, jnp.concatenate([predictor(tableau, *params), euler, zero]), params)
+        # The unknown is N μ over the length of N, a part of y: with heavy masses or small constraints μ itself is large.
+        normals = args.normals(time_sign(terms, t0, t1) * t0, y0)
+        moved = jax.jacfwd(lambda mu: ravel_pytree(args.displace(y0, normals, mu))[0])(zero)
+        lengths = jnp.max(jnp.abs(moved), 0)
+        lengths = jax.lax.stop_gradient(jnp.where(lengths > 0, lengths, 1))
+        params = (terms, args, t0, t1, y0, lengths)
+        euler = flat + ravel_pytree(vector_field(terms, args, t0, t1)(t0, y0))[0]
+        x, found = newton(residual, jnp.concatenate([predictor(tableau, *params[:-1]), euler, zero]), params)
         y1 = or_nan(found, unravel(x[stages : stages + flat.size]))
         return y1, None, hermite(terms, args, t0, t1, y0, y1), None, outcome(found)
 

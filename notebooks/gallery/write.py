@@ -39,6 +39,7 @@ PAGES = """
 | | |
 |---|---|
 | [Which method](which_method.md) | a short list of decisions, and what each method does, measured |
+| [What each method can take](stress.md) | method × stressor, measured: scales, singularities, long times, large steps |
 | [Scenes](scenes.md) | ready systems with independent references, solved and drawn |
 | [Coming from another solver](coming_from.md) | diffrax, scipy, SUNDIALS, Modelica, MuJoCo: theirs and ours |
 | [Errors](errors.md) | each by name: cause, equation, remedy, a program that ends in it |

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.stress import __main__ as stress
 from dae_jax.app import cli, compare, maps
 from dae_jax.app.cli import main
 from dae_jax.app.interrupts import interruptible
@@ -183,6 +184,15 @@ WRONG = {
     "bench --repeats 0": "--repeats must be at least 1",
     "bench --quick --peers heyoka_peer": "--quick takes no --peers",
     "bench --out /proc/nope": "cannot be written",
+    "stress no-such-scene": "unknown scene 'no-such-scene'",
+    "stress robertson": "robertson is no mechanism",
+    "stress --methods magic": "unknown method 'magic'; choose from projection-tsit5",
+    "stress --methods=": "unknown method ''; choose from projection-tsit5",
+    "stress --stressors magic": "unknown family 'magic'; choose from",
+    "stress pendulum --stressors scales": "--stressors is not for scenes",
+    "stress --limit 0": "--limit must be positive",
+    "stress --quick --no-such-option": "unrecognized arguments: --no-such-option",
+    "stress --out /proc/nope": "--out '/proc/nope' cannot be written",
     "no-such-verb": "invalid choice: 'no-such-verb'",
     "": "required: command",
 }
@@ -197,6 +207,7 @@ def test_wrong_arguments_end_with_one_line_and_status_2_before_any_work(line, mo
     monkeypatch.setattr(compare, "measure", too_late)
     monkeypatch.setattr(maps, "sweep", too_late)
     monkeypatch.setattr(maps, "descent", too_late)
+    monkeypatch.setattr(stress, "run", too_late)
     with pytest.raises(SystemExit) as end:
         main(line.split())
     assert end.value.code == 2
@@ -204,7 +215,7 @@ def test_wrong_arguments_end_with_one_line_and_status_2_before_any_work(line, mo
     assert WRONG[line] in captured.err
     assert not captured.out
     # The benchmarks have a parser of their own, which shows its usage too.
-    assert captured.err.count("\n") == 1 or line.startswith("bench")
+    assert captured.err.count("\n") == 1 or line.startswith(("bench", "stress"))
 
 
 def test_every_option_of_every_verb_is_in_the_table():

@@ -44,6 +44,19 @@ def test_an_inconsistent_start_names_the_remedy_and_the_remedy_works():
     solve(y0=good)
 
 
+def test_a_tiny_mechanism_that_is_off_by_a_hundredth_of_itself_is_refused():
+    """Of a micrometre 1 % is less than what counts as round-off of a metre."""
+    length = 1e-6
+    system = dae_jax.ConstrainedSystem(
+        lambda t, q, v, args: jnp.array([0.0, 9.81]), lambda t, q, args: (q @ q - length**2) / 2
+    )
+    q, v = np.array([0.6, 0.8]) * length, np.zeros(2)
+    solve = lambda q: dae_jax.daesolve(system, dae_jax.RATTLE(), 0.0, 1e-5, 1e-6, (q, v))
+    assert np.isfinite(solve(q).final[0]).all()
+    with pytest.raises(ValueError, match=r"constraint\[0\] \(g\) is off by"):
+        solve(q * 1.01)
+
+
 def test_consistent_state_keeps_what_is_fixed_and_is_differentiable():
     fixed = (np.array([True, False]), np.array([False, False]))
     q, v = dae_jax.consistent_state(SCENE.system, 0.0, (np.array([0.6, 0.7]), np.array([1.0, 0.0])), fixed=fixed)

@@ -124,3 +124,19 @@ def test_a_voltage_jumps_from_one_side_of_a_diode_to_the_other(solver, announced
         current, voltage, node = solve(tolerance)
         np.testing.assert_allclose([current, voltage], y, atol=(30 if announced else 50) * tolerance + 2e-6)
         assert -1.2 < node < -0.9
+
+
+@pytest.mark.parametrize("solver", [dae_jax.DOP853(), diffrax.Tsit5()], ids=["dop853", "tsit5"])
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_force_that_becomes_infinite_ends_the_solve_at_its_time(solver, bad):
+    """In few steps: an infinite error over an infinite state is no number, of which a next step was made, again and again."""
+    system = dae_jax.ConstrainedSystem(
+        lambda t, q, v, args: jnp.stack([0 * t, 9.81 + jnp.where(t > 1, args, 0)]), lambda t, q, args: (q @ q - 1) / 2
+    )
+    angle = dae_jax.StateSpace(lambda z: jnp.stack([jnp.sin(z[0]), jnp.cos(z[0])]))
+    sol = dae_jax.daesolve(
+        system, solver, 0.0, 2.0, None, (np.array([0.6, 0.8]), np.zeros(2)), bad, formulation=angle, throw=False,
+        stepsize_controller=CONTROL, max_steps=10_000,
+    )  # fmt: skip
+    assert sol.stats["end_time"] == pytest.approx(1, abs=1e-12)
+    assert sol.stats["num_steps"] < 200

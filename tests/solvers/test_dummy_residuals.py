@@ -28,7 +28,17 @@ def test_through_many_switches():
     assert int(sol.stats["switches"]) > 6
     assert PENDULUM.error(times, sol.ys) < 1e-6
     drift = dae_jax.drift(PENDULUM.system, sol)
-    assert max(drift.position.max(), drift.velocity.max()) < 1e-8
+    assert max(drift.position.max(), drift.velocity.max()) < 1e-11
+
+
+@pytest.mark.parametrize("solver", [dae_jax.BDF(), dae_jax.RadauIIA5()])
+def test_on_the_constraints_at_a_low_tolerance(solver):
+    """At a step's end, and between."""
+    save = diffrax.SaveAt(ts=np.linspace(0.5, 2, 31), t1=True)
+    sol = solved(PENDULUM.system, solver, 2.0, PENDULUM.y0, 1e-3, saveat=save)
+    drift = dae_jax.drift(PENDULUM.system, sol)
+    assert max(drift.position.max(), drift.velocity.max()) < 1e-13
+    assert 1e-6 < PENDULUM.error(sol.ts, sol.ys) < 0.1
 
 
 def test_order_five():

@@ -128,6 +128,29 @@ def test_transformations_compose_in_any_order(name):
     np.testing.assert_allclose(COMPOSED[name](end, angles), central, rtol=1e-7)
 
 
+@pytest.mark.parametrize(("mass", "factor"), [(1e8, 1.0), (1.0, 1e-8)])
+def test_symmetric_projection_does_not_depend_on_the_units_of_mass_and_constraint(mass, factor):
+    """μ is large where masses are, or where the constraint is small; what it moves is not."""
+    system = dae_jax.ConstrainedSystem(
+        lambda t, q, v, args: mass * jnp.array([0.0, 9.81]),
+        lambda t, q, args: factor * (q @ q - 1) / 2,
+        mass * np.ones(2),
+    )
+    solver = dae_jax.SymmetricProjection(dae_jax.Trapezoid())
+    found, plain = (dae_jax.daesolve(x, solver, 0.0, 1.0, 0.01, SCENE.y0).final for x in (system, SCENE.system))
+    np.testing.assert_allclose(found, plain, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("method", [m for m in METHODS if not m.twin], ids=lambda m: m.name)
+def test_a_state_in_float32_stays_one(method):
+    """Beside float64, in which times and parameters are."""
+    y0 = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), SCENE.y0)
+    sol = solve(method, 1.0, 0.01, y0, saveat=diffrax.SaveAt(ts=np.array([0.5, 1.0])))
+    assert {x.dtype for x in sol.ys} == {jnp.dtype(jnp.float32)}
+    for found, exact in zip(sol.ys, SCENE.reference(np.array([0.5, 1.0])), strict=True):
+        np.testing.assert_allclose(found, exact, rtol=0, atol=5e-3)
+
+
 def test_symmetric_projection_goes_back_to_where_it_came_from():
     method = dae_jax.SymmetricProjection(dae_jax.Trapezoid())
     there = dae_jax.daesolve(SCENE.system, method, 0.0, 1.0, 0.02, SCENE.y0)

@@ -1,6 +1,9 @@
 """The findings of Pöll, Hafner and Heinzl, and the accuracy that the library claims."""
 
+import dataclasses
+
 import diffrax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -128,6 +131,17 @@ def test_redundant_constraints_give_multipliers_of_least_norm():
     assert b.rank == 3
     few, many = (np.asarray(dae_jax.multipliers(s.system, x))[0] for s, x in ((plain, a), (redundant, b)))
     assert np.linalg.norm(many) < np.linalg.norm(few)
+
+
+def test_a_chart_has_a_coordinate_for_each_independent_constraint_less():
+    scene = pendulum()
+    twice = dataclasses.replace(scene.system, constraint=lambda t, q, args: jnp.array([1.0, 2.0]) * (q @ q - 1) / 2)
+    chart = dae_jax.StateSpace(lambda z: jnp.stack([jnp.sin(z[0]), jnp.cos(z[0])]))
+    plain, redundant = (
+        dae_jax.daesolve(system, diffrax.Tsit5(), 0.0, 1.0, None, scene.y0, scene.args, formulation=chart).final
+        for system in (scene.system, twice)
+    )
+    np.testing.assert_allclose(redundant, plain, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("rate", [0.5, 7.0, -7.0])

@@ -234,6 +234,21 @@ class TestSingularConfiguration:
         # The crank's pin is as far from the pivot as both rods are long.
         np.testing.assert_allclose(1.5**2 + 2**2 - 6 * jnp.cos(sol.ts[-1] + 0.5), 4.0, atol=1e-6)
 
+    def test_dummy_derivatives_do_not_leap_over_a_dead_centre_that_is_nearly_one(self):
+        """The rod is longer than the crank by 1e-12: where the crank is level the slider stops short of the other side."""
+        excess = 2e-12
+        system = ConstrainedSystem(
+            lambda t, q, v, args: 0 * q, lambda t, q, args: (q[1] ** 2 - 2 * q[1] * jnp.sin(q[0]) - excess) / 2
+        )
+        sine, cosine = np.sin(0.8), np.cos(0.8)
+        root = np.sqrt(sine**2 + excess)
+        y0 = jnp.array([0.8, sine + root]), -2.0 * jnp.array([1.0, cosine * (1 + sine / root)])
+        sol = solve(system, dae_jax.DOP853(), y0, t1=0.6, formulation=dae_jax.DummyDerivatives())
+        (angle,), (slider,) = sol.ys[0].T
+        assert angle < -0.4
+        # η/(√(sin² θ + η) − sin θ) in place of s = sin θ + √(sin² θ + η), which has no digits left here.
+        np.testing.assert_allclose(slider, excess / (np.hypot(np.sin(angle), excess**0.5) - np.sin(angle)), atol=1e-12)
+
     def test_a_slider_crank_of_equal_lengths_passes_its_dead_centre(self):
         def constraint(t, q, args):
             return jnp.stack([circle(q[:2]), ((q[2] - q[0]) ** 2 + q[1] ** 2 - 1) / 2])
