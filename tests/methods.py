@@ -45,6 +45,5 @@ METHODS = [
     Method("tangent-dopri8", dae_jax.TangentSpace(diffrax.Dopri8()), 8, True, adaptive=True, twin=True),
     Method("state-space", diffrax.Tsit5(), 5, True, dae_jax.StateSpace(pendulum_chart), adaptive=True),
     Method("radau", dae_jax.RadauIIA5(), 5, adaptive=True),
-    Method("radau9", dae_jax.RadauIIA9(), 9, adaptive=True, twin=True),
     Method("rattle", dae_jax.RATTLE(), 2, True),
 ]
