@@ -45,6 +45,8 @@ from .solvers import (
     Midpoint as Midpoint,
     OrthogonalProjection as OrthogonalProjection,
     RadauIIA5 as RadauIIA5,
+    RadauIIA9 as RadauIIA9,
+    RadauIIA13 as RadauIIA13,
     SymmetricProjection as SymmetricProjection,
     TangentSpace as TangentSpace,
     Trapezoid as Trapezoid,

@@ -1,30 +1,18 @@
-"""Radau IIA with three stages for 0 = F(t, y, ẏ)."""
+"""Radau IIA with three, five and seven stages for 0 = F(t, y, ẏ)."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from ..compiler import is_large
 from ..linalg import implicit_root
 from .manifold import time_sign
-from .radau_coefficients import (
-    ALPHA,
-    AT_START,
-    BACK,
-    BETA,
-    BETWEEN,
-    ERROR,
-    GAMMA,
-    INVERSE,
-    NODES,
-    POLYNOMIAL,
-    TRANSFORM,
-)
+from .radau_coefficients import Coefficients, coefficients
+from .radau_step import CollocationPolynomial, Step, along, coupled, linear_solve
 from .replay import Replayable
 from .residual_steps import (
     AbstractResidualSolver,
@@ -34,7 +22,6 @@ from .residual_steps import (
     constant,
     corrected,
     goes_on,
-    is_smallest,
     not_begun,
     of_step,
     passes_a_kink,
@@ -46,35 +33,10 @@ from .residual_steps import (
 
 # The Jacobian is kept for the next step while Newton's method contracts faster than this.
 FAST = 1e-2
-
-
-class CollocationPolynomial(diffrax.AbstractLocalInterpolation):
-    """The polynomial of degree 3 through the step's start and its stages y₀ + zᵢ."""
-
-    t0: Any
-    t1: Any
-    y0: Any
-    z: Any
-
-    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Any:
-        """The value at `t0`, or the increment from there to `t1`."""
-        if t1 is not None:
-            return self.evaluate(t1) - self.evaluate(t0)
-        h = self.t1 - self.t0
-        # After a jump in time diffrax asks for a point that is before the step by round-off.
-        part = jnp.clip((t0 - self.t0) / jnp.where(h == 0, 1, h), 0, 1)
-        # In a step that a jump may be in, the value is that after it.
-        return self.y0 + jnp.where(is_smallest(self.t0, self.t1), self.z[2], _along(self.z, part))
-
-
-def _along(z: Float[Array, "3 n"], s: Any) -> Float[Array, " n"]:
-    c = _combined(POLYNOMIAL, z)
-    return s * (c[0] + s * (c[1] + s * c[2]))
-
-
-def _combined(a: Any, x: Any) -> list[Any]:
-    """A x for a matrix of numbers and the rows of x, written out."""
-    return [sum(float(c) * x[k] for k, c in enumerate(row)) for row in a]
+# As many more corrections for each stage more than three (the program RADAU).
+PATIENCE = 2.5
+# By which diffrax lets a step grow at most.
+GROWTH = 10
 
 
 class _State(NamedTuple):
@@ -85,7 +47,7 @@ class _State(NamedTuple):
     method.
     """
 
-    z: Float[Array, "3 n"]
+    z: Float[Array, "s n"]
     h: Float[Array, ""]
     rates: Float[Array, " n"]
     jacobians: Any
@@ -95,85 +57,100 @@ class _State(NamedTuple):
     eta: Float[Array, ""]
 
 
-class _Factors(NamedTuple):
-    """The factors of the `real` and the `complex` iteration matrix, and what may be `round_off` of each equation."""
+class AbstractRadauIIA(Replayable, AbstractResidualSolver):
+    """The Radau IIA method with `stages` stages."""
 
-    real: Any
-    complex: Any
-    round_off: Float[Array, " n"]
+    stages: eqx.AbstractClassVar[int]
 
+    highest_index = 3
+    default_index = 2
+    interpolation_cls = CollocationPolynomial
 
-class _Step(NamedTuple):
-    """The equations of a step: a pytree, so that they can be differentiated.
+    dense: bool = True
 
-    In the smallest step that time resolves the three stages are one, that of the implicit Euler method: where a variable
-    jumps, equations of both sides of the jump need have no solution together, those of one side have.
-    """
+    def order(self, terms: Any) -> int:
+        return 2 * self.stages - 1
 
-    linearised: Any
-    sign: Any
-    t0: Any
-    t1: Any
-    y0: Float[Array, " n"]
+    def error_order(self, terms: Any) -> int:
+        return self.stages + 1
 
-    @property
-    def smallest(self) -> Any:
-        """Whether time resolves no smaller step."""
-        return is_smallest(self.t0, self.t1)
+    def _tolerances(self, dtype: Any) -> Tolerances:
+        tol = tolerances(self.rtol, self.atol, dtype)
+        return tol._replace(corrections=tol.corrections + int(PATIENCE * (self.stages - 3)))
 
-    @property
-    def rates(self) -> Float[Array, "3 3"]:
-        """h times ẏ at the stages by zⱼ."""
-        inverse = jnp.asarray(INVERSE, self.y0.dtype)
-        return jnp.where(self.smallest, jnp.eye(3, dtype=inverse.dtype), inverse)
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> _State:
+        sign = time_sign(terms, t0, t1)
+        zero = jnp.zeros((), y0.dtype)
+        step = Step(coefficients(self.stages), args, sign, t0, t1, y0)
+        tol = self._tolerances(y0.dtype)
+        unused = jax.eval_shape(lambda: (j := step.jacobians(t0, y0, y0), step.factor(j, tol)[0]))
+        jacobians, factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), unused)
+        return _State(
+            jnp.zeros((self.stages, y0.size), y0.dtype),
+            zero,
+            args.start,
+            jacobians,
+            factors,
+            zero,
+            jnp.asarray(True),
+            zero + 1,
+        )
 
-    @property
-    def h(self) -> Any:
-        # A lane of a batch that has ended goes on with steps of length 0, whose derivatives are multiplied by 0.
-        return jnp.where(self.t1 == self.t0, 1, self.t1 - self.t0)
+    def invalidate_jacobian(self, state: _State) -> _State:
+        return state._replace(refresh=jnp.ones_like(state.refresh))
 
-    def stages(self, z: Float[Array, "3 n"]) -> Any:
-        """(tᵢ, Yᵢ, ẏ at tᵢ) of each stage."""
-        rates = [jnp.where(self.smallest, z[i], rate) for i, rate in enumerate(_combined(INVERSE, z))]
-        times = [self.t1 if c == 1 else jnp.where(self.smallest, self.t1, self.t0 + float(c) * self.h) for c in NODES]
-        return [(self.sign * t, self.y0 + z[i], rates[i] * (self.sign / self.h)) for i, t in enumerate(times)]
+    def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: _State, made_jump: Any) -> Any:
+        state = solver_state._replace(
+            refresh=solver_state.refresh | made_jump, h=jnp.where(made_jump, 0, solver_state.h)
+        )
+        step = Step(coefficients(self.stages), args, time_sign(terms, t0, t1), t0, t1, y0)
+        tol = self._tolerances(y0.dtype)
+        z, (newton, jacobians, factors, pivot) = _stages(lambda params: _solve(*params), (step, constant(state), tol))
+        y1 = y0 + z[-1]
+        scaled = counted = _error(*constant((step, factors.real, z)), tol) * args.weights(step.h)
+        if args.between(self.dense).any():
+            weights = args.weights(step.h, tol.raised()) * args.between(self.dense)
+            between = _between(step.method, *constant((state, step.h, z))) * weights
+            counted = jnp.where(jnp.abs(between) > jnp.abs(scaled), between, scaled)
+        rates, smallest = step.stages(z)[-1][2], step.smallest
+        # What is algebraic may jump in the smallest step.
+        bend = constant((rates - state.rates) * (step.h / 2)) * args.structure.differential
+        scaled = jnp.where(smallest, bend, counted)
+        failure = of_step(newton.converged, pivot, y0.size, tol.norm(scaled, y0, y1))
+        y1, scaled, result = at_min_step(failure, t0, t1, y0, y1, scaled)
+        slow = (newton.theta > FAST) & (newton.count > 1)
+        # What jumped says nothing of the next step.
+        size = jnp.where(smallest, 0, step.h)
+        new = _State(z, size, rates, jacobians, factors, size, slow, newton.eta)
+        return y1, scaled, {"y0": y0, "z": z}, constant(new), result
 
-    def at_stages(self, fn: Callable[..., Any], z: Float[Array, "3 n"]) -> list[Any]:
-        """fn(t, y, ẏ) at each stage: in a loop where it is large."""
-        stages = self.stages(z)
-        if not is_large(fn, *stages[0]):
-            return [fn(*stage) for stage in stages]
-        found = lax.map(lambda stage: fn(*stage), jax.tree.map(lambda *x: jnp.stack(x), *stages))
-        return [jax.tree.map(lambda x, i=i: x[i], found) for i in range(3)]
-
-    def residuals(self, z: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
-        """F at the stages."""
-        return jnp.stack(self.at_stages(self.linearised.residual, z))
-
-    def jacobians(self, t: Any, y: Any, yd: Any) -> tuple[Any, Any]:
-        """∂F/∂y and ∂F/∂(dy/dτ) for the loop's own time τ = ± t."""
-        j, m = self.linearised.jacobians(t, y, yd)
-        return j, self.sign * m
-
-    def factor(self, jacobians: Any, tol: Tolerances) -> tuple[_Factors, Float[Array, ""]]:
-        """The factors of γ/h M + J, in the smallest step of M/h + J, and of (α + iβ)/h M + J, and the smallest pivot."""
-        j, m = jacobians
-        real, pivot = self.linearised.factor(j, m, jnp.where(self.smallest, 1, GAMMA) / self.h, self.h)
-        both, other = self.linearised.factor(j, m, lax.complex(ALPHA / self.h, BETA / self.h), self.h)
-        round_off = tol.round_off(self.linearised, j, m, 1 / self.h, self.y0)
-        return _Factors(real, both, round_off), jnp.minimum(pivot, other)
-
-    def correction(self, factors: _Factors, residuals: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
-        """Δz of simplified Newton, decoupled into a real and a complex system."""
-        real, both, _ = factors
-        first, second, third = _combined(BACK, residuals)
-        w = self.linearised.solve(real, jnp.where(self.smallest, residuals[2], first))
-        v = self.linearised.solve(both, lax.complex(second, third))
-        stages = _combined(TRANSFORM, [w, jnp.real(v), jnp.imag(v)])
-        return -jnp.stack([jnp.where(self.smallest, w, stage) for stage in stages])
+    def replay(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, history: Any, dense: Any) -> Any:
+        step = Step(coefficients(self.stages), args, time_sign(terms, t0, t1), t0, t1, y0)
+        z, _ = _stages(lambda params: (params[1], ()), (step, constant(dense["z"])))
+        return y0 + z[-1], history, {"y0": y0, "z": z}
 
 
-class RadauIIA5(Replayable, AbstractResidualSolver):
+def _stages(iterate: Callable[[Any], Any], params: Any) -> tuple[Float[Array, "s n"], Any]:
+    """The stages zᵢ, and how they were found, with their derivative; `params` holds the `Step` first."""
+    # The unknowns of a stage are interleaved, so that a band stays one.
+    count = len(params[0].method.nodes)
+    apart, together = lambda z: z.reshape(-1, count).T, lambda z: z.T.reshape(-1)
+
+    def found(params: Any) -> Any:
+        z, how = iterate(params)
+        return together(z), how
+
+    flat, how = implicit_root(
+        lambda z, params: together(params[0].residuals(apart(z))),
+        found,
+        params,
+        linear_solve=linear_solve,
+        jacobian=lambda z, params: coupled(params[0], apart(z)),
+    )
+    return apart(flat), how
+
+
+class RadauIIA5(AbstractRadauIIA):
     """The Radau IIA method with three stages: order 5, stiffly accurate, L-stable, for 0 = F(t, y, ẏ) of index 0 to 3.
 
         0 = F(t₀ + cᵢ h, Yᵢ, Kᵢ),   Yᵢ = y₀ + h Σ aᵢⱼ Kⱼ,   y₁ = Y₃.
@@ -204,90 +181,56 @@ class RadauIIA5(Replayable, AbstractResidualSolver):
     Methods*, table 2.3, for the orders.
     """
 
-    dense: bool = True
-
-    highest_index = 3
-    default_index = 2
-    interpolation_cls = CollocationPolynomial
-
-    def order(self, terms: Any) -> int:
-        return 5
-
-    def error_order(self, terms: Any) -> int:
-        return 4
-
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> _State:
-        sign = time_sign(terms, t0, t1)
-        zero = jnp.zeros((), y0.dtype)
-        step = _Step(args, sign, t0, t1, y0)
-        tol = tolerances(self.rtol, self.atol, y0.dtype)
-        unused = jax.eval_shape(lambda: (j := step.jacobians(t0, y0, y0), step.factor(j, tol)[0]))
-        jacobians, factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), unused)
-        return _State(
-            jnp.zeros((3, y0.size), y0.dtype), zero, args.start, jacobians, factors, zero, jnp.asarray(True), zero + 1
-        )
-
-    def invalidate_jacobian(self, state: _State) -> _State:
-        return state._replace(refresh=jnp.ones_like(state.refresh))
-
-    def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: _State, made_jump: Any) -> Any:
-        state = solver_state._replace(
-            refresh=solver_state.refresh | made_jump, h=jnp.where(made_jump, 0, solver_state.h)
-        )
-        step = _Step(args, time_sign(terms, t0, t1), t0, t1, y0)
-        tol = tolerances(self.rtol, self.atol, y0.dtype)
-        z, (newton, jacobians, factors, pivot) = _stages(lambda params: _solve(*params), (step, constant(state), tol))
-        y1 = y0 + z[2]
-        scaled = counted = _error(*constant((step, factors.real, z)), tol) * args.weights(step.h)
-        if args.between(self.dense).any():
-            weights = args.weights(step.h, tol.raised()) * args.between(self.dense)
-            between = _between(*constant((state, step.h, z))) * weights
-            counted = jnp.where(jnp.abs(between) > jnp.abs(scaled), between, scaled)
-        rates, smallest = step.stages(z)[2][2], step.smallest
-        # What is algebraic may jump in the smallest step.
-        bend = constant((rates - state.rates) * (step.h / 2)) * args.structure.differential
-        scaled = jnp.where(smallest, bend, counted)
-        failure = of_step(newton.converged, pivot, y0.size, tol.norm(scaled, y0, y1))
-        y1, scaled, result = at_min_step(failure, t0, t1, y0, y1, scaled)
-        slow = (newton.theta > FAST) & (newton.count > 1)
-        # What jumped says nothing of the next step.
-        size = jnp.where(smallest, 0, step.h)
-        new = _State(z, size, rates, jacobians, factors, size, slow, newton.eta)
-        return y1, scaled, {"y0": y0, "z": z}, constant(new), result
-
-    def replay(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, history: Any, dense: Any) -> Any:
-        step = _Step(args, time_sign(terms, t0, t1), t0, t1, y0)
-        z, _ = _stages(lambda params: (params[1], ()), (step, constant(dense["z"])))
-        return y0 + z[2], history, {"y0": y0, "z": z}
+    stages = 3
 
 
-def _stages(iterate: Callable[[Any], Any], params: Any) -> tuple[Float[Array, "3 n"], Any]:
-    """The stages zᵢ, and how they were found, with their derivative; `params` holds the `_Step` first."""
-    # The unknowns of a stage are interleaved, so that a band stays one.
-    apart, together = lambda z: z.reshape(-1, 3).T, lambda z: z.T.reshape(-1)
+class RadauIIA9(AbstractRadauIIA):
+    """The Radau IIA method with five stages, for tight tolerances: order 9, otherwise as `RadauIIA5`.
 
-    def found(params: Any) -> Any:
-        z, how = iterate(params)
-        return together(z), how
+    A real and two complex systems for each correction; the embedded formula has order 5. Orders: 9 for ODEs and index 1; for
+    index 2, 9 for the differential variables and 5 for the algebraic ones; for index 3, 9, 5 and 4 for variables of index 1,
+    2 and 3. Between the ends of a step the error is of order 6, where values there are wanted.
 
-    flat, how = implicit_root(
-        lambda z, params: together(params[0].residuals(apart(z))),
-        found,
-        params,
-        linear_solve=_linear_solve,
-        jacobian=lambda z, params: _coupled(params[0], apart(z)),
-    )
-    return apart(flat), how
+    **Arguments**
+
+    - `dense`, `rtol`, `atol`: as for `RadauIIA5`.
+
+    Source: E. Hairer, G. Wanner, *Stiff differential equations solved by Radau methods*, J. Comput. Appl. Math. 111 (1999), and
+    the program RADAU.
+    """
+
+    stages = 5
 
 
-def _predicted(state: _State, h: Any) -> Float[Array, "3 n"]:
-    """The stages on the last step's polynomial; 0 without one."""
+class RadauIIA13(AbstractRadauIIA):
+    """The Radau IIA method with seven stages, for the tightest tolerances: order 13, otherwise as `RadauIIA5`.
+
+    A real and three complex systems for each correction; the embedded formula has order 7. Orders: 13 for ODEs and index 1;
+    for index 2, 13 for the differential variables and 7 for the algebraic ones; for index 3, 13, 7 and 6 for variables of
+    index 1, 2 and 3. Between the ends of a step the error is of order 8, where values there are wanted.
+
+    **Arguments**
+
+    - `dense`, `rtol`, `atol`: as for `RadauIIA5`.
+
+    Source: as for `RadauIIA9`.
+    """
+
+    stages = 7
+
+
+def _predicted(state: _State, h: Any) -> Float[Array, "s n"]:
+    """The stages on the last step's polynomial; 0 without one, or where it does not reach."""
+    method = coefficients(len(state.z))
     ratio = h / jnp.where(state.h == 0, 1, state.h)
-    ahead = jnp.stack([_along(state.z, 1 + float(c) * ratio) - state.z[2] for c in NODES])
-    return jnp.where(state.h == 0, 0, ahead)
+    ahead = jnp.stack([along(state.z, 1 + float(c) * ratio) - state.z[-1] for c in method.nodes])
+    none = state.h == 0
+    if method.reach < GROWTH:
+        none = none | (ratio > method.reach)
+    return jnp.where(none, 0, ahead)
 
 
-def _solve(step: _Step, state: _State, tol: Tolerances) -> Any:
+def _solve(step: Step, state: _State, tol: Tolerances) -> Any:
     """The stages, and how they were found: with the Jacobian at hand first, with new ones where these fail, and in the
     smallest step with new ones for each correction.
     """
@@ -299,7 +242,7 @@ def _solve(step: _Step, state: _State, tol: Tolerances) -> Any:
         tries, fresh, before, jacobians, factors, _ = carry
         renew = (tries > 0) | state.refresh | smallest
         start = start_of(tries, jnp.where(tries == 0, predicted, 0), before.x)
-        t, y = jnp.where(smallest, step.t1, step.t0), jnp.where(smallest, step.y0 + start[2], step.y0)
+        t, y = jnp.where(smallest, step.t1, step.t0), jnp.where(smallest, step.y0 + start[-1], step.y0)
         evaluate = lambda: step.jacobians(step.sign * t, y, state.rates)
         jacobians = lax.cond(renew, evaluate, lambda: jacobians)
         infinite = jnp.full_like(h, jnp.inf)
@@ -310,7 +253,7 @@ def _solve(step: _Step, state: _State, tol: Tolerances) -> Any:
         )
         correction = lambda residuals: step.correction(factors, residuals)
         iteration = Iteration(step.residuals, correction, factors.round_off)
-        scale = lambda z: weights / tol.scale(step.y0, step.y0 + z[2])
+        scale = lambda z: weights / tol.scale(step.y0, step.y0 + z[-1])
         newton = lax.cond(
             smallest & (tries > 0),
             lambda: corrected(iteration, start, tries, scale, differential, state.eta, tol),
@@ -331,9 +274,9 @@ def _solve(step: _Step, state: _State, tol: Tolerances) -> Any:
     return z, (found, jacobians, factors, pivot)
 
 
-def _error(step: _Step, factor: Any, z: Any, tol: Tolerances) -> Float[Array, " n"]:
+def _error(step: Step, factor: Any, z: Any, tol: Tolerances) -> Float[Array, " n"]:
     """−(γ/h M + J)⁻¹ F(t₀, y₀, −Σ eᵢ zᵢ/h), once more from y₀ + error where that is large (eqs. IV.8.19, IV.8.20)."""
-    rate = sum(float(e) * z[i] for i, e in enumerate(ERROR)) * (-step.sign / step.h)
+    rate = sum(float(e) * z[i] for i, e in enumerate(step.method.error)) * (-step.sign / step.h)
 
     def again(carry: Any) -> Any:
         count, _, size = carry
@@ -342,29 +285,17 @@ def _error(step: _Step, factor: Any, z: Any, tol: Tolerances) -> Float[Array, " 
     def estimate(carry: Any) -> Any:
         count, error, _ = carry
         error = -step.linearised.solve(factor, step.linearised.residual(step.sign * step.t0, step.y0 + error, rate))
-        return count + 1, error, tol.norm(error * step.linearised.weights(step.h), step.y0, step.y0 + z[2])
+        return count + 1, error, tol.norm(error * step.linearised.weights(step.h), step.y0, step.y0 + z[-1])
 
     return lax.while_loop(again, estimate, (0, jnp.zeros_like(step.y0), jnp.zeros_like(step.h)))[1]
 
 
-def _between(state: _State, h: Any, z: Any) -> Float[Array, " n"]:
+def _between(method: Coefficients, state: _State, h: Any, z: Any) -> Float[Array, " n"]:
     """The largest error of the polynomial through the step's points, by the start of the step before."""
     # 1 where there was none, which is as good as any.
-    before = -jnp.where(state.h == 0, 1, state.h / h)
-    off = _along(z, before) + state.z[2]
-    reach = before * (before - 1) * (before - float(NODES[0])) * (before - float(NODES[1]))
-    at_start = sum(float(c) * z[i] for i, c in enumerate(AT_START))
-    return jnp.where(state.h == 0, at_start, off * (BETWEEN / reach))
-
-
-def _coupled(step: _Step, z: Float[Array, "3 n"]) -> Any:
-    """The Jacobian of all stages at the solution, in the storage of their unknowns interleaved."""
-    found = step.at_stages(step.jacobians, z)
-    storage, matrix = step.linearised.storage.coupled([j for j, _ in found], [m for _, m in found], step.rates / step.h)
-    return storage, matrix, jnp.repeat(step.linearised.column_scale(step.h), 3)
-
-
-def _linear_solve(jacobian: Any, b: Float[Array, " 3n"]) -> Float[Array, " 3n"]:
-    storage, matrix, scale = jacobian
-    factors, _ = storage.factor(storage.scale_columns(matrix, scale))
-    return scale * storage.solve(factors, b)
+    before = reach = -jnp.where(state.h == 0, 1, state.h / h)
+    for c in method.nodes:
+        reach = reach * (before - float(c))
+    off = along(z, before) + state.z[-1]
+    at_start = sum(float(c) * z[i] for i, c in enumerate(method.at_start))
+    return jnp.where(state.h == 0, at_start, off * (method.between / reach))

@@ -35,8 +35,8 @@ PAGES = {
     "solvers": (
         "Solvers",
         "How a step is taken; beside these, any solver of diffrax. [Which method when](../which_method.md).",
-        "OrthogonalProjection TangentSpace SymmetricProjection Trapezoid Midpoint Gauss4 RATTLE DOP853 RadauIIA5 BDF "
-        "AbstractManifoldSolver AbstractResidualSolver",
+        "OrthogonalProjection TangentSpace SymmetricProjection Trapezoid Midpoint Gauss4 RATTLE DOP853 RadauIIA5 "
+        "RadauIIA9 RadauIIA13 BDF AbstractManifoldSolver AbstractResidualSolver",
     ),
     "starts_and_events": (
         "Starts and events",

@@ -85,7 +85,12 @@ def methods() -> list[diffrax.AbstractSolver[Any]]:
         dae_jax.SymmetricProjection(dae_jax.Gauss4()),
         dae_jax.RATTLE(),
     ]
-    of_residuals: list[dae_jax.AbstractResidualSolver] = [dae_jax.RadauIIA5(), dae_jax.BDF()]
+    of_residuals: list[dae_jax.AbstractResidualSolver] = [
+        dae_jax.RadauIIA5(),
+        dae_jax.RadauIIA9(),
+        dae_jax.RadauIIA13(),
+        dae_jax.BDF(),
+    ]
     return [*keeping, *of_residuals]
 
 

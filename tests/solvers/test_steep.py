@@ -43,12 +43,13 @@ SYSTEMS = {
 }
 METHODS = {
     "radau": (dae_jax.RadauIIA5(), None),
+    "radau of order 13": (dae_jax.RadauIIA13(), None),
     "bdf": (dae_jax.BDF(), None),
     "dummy derivatives, explicit": (diffrax.Tsit5(), dae_jax.DummyDerivatives()),
     "dummy derivatives, radau": (dae_jax.RadauIIA5(), dae_jax.DummyDerivatives()),
     "dummy derivatives, bdf": (dae_jax.BDF(), dae_jax.DummyDerivatives()),
 }
-AS_WRITTEN = ["radau", "bdf"]
+AS_WRITTEN = ["radau", "radau of order 13", "bdf"]
 
 
 @pytest.mark.parametrize("system", SYSTEMS)

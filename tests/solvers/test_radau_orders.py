@@ -1,0 +1,137 @@
+"""RadauIIA9 and RadauIIA13: what more stages change. What they share with RadauIIA5 is tested there."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dae_jax
+from dae_jax.scenes import SCENES
+
+
+NINE, THIRTEEN = dae_jax.RadauIIA9(), dae_jax.RadauIIA13()
+NAMES = {NINE: "9", THIRTEEN: "13"}
+BOTH = pytest.mark.parametrize("solver", NAMES, ids=NAMES.get)
+
+
+def fixed(system, solver, t1, steps, y0):
+    return dae_jax.daesolve(
+        system, solver, 0.0, t1, t1 / steps, y0, stepsize_controller=diffrax.ConstantStepSize(), max_steps=1000
+    ).ys  # fmt: skip
+
+
+def adaptive(system, solver, t1, y0, rtol=1e-8, atol=None, args=None, **options):
+    control = diffrax.PIDController(rtol=rtol, atol=rtol if atol is None else atol)
+    return dae_jax.daesolve(system, solver, 0.0, t1, None, y0, args, stepsize_controller=control, **options)
+
+
+OSCILLATORS = {
+    "ODE": lambda t, y, yd, args: jnp.stack([yd[0] - y[1], yd[1] + y[0]]),
+    "index 1": lambda t, y, yd, args: jnp.stack([yd[0] - y[2], yd[1] + y[0], y[2] - y[1]]),
+}
+
+
+@pytest.mark.parametrize(("solver", "kind"), [(NINE, "index 1"), (THIRTEEN, "ODE"), (THIRTEEN, "index 1")])
+def test_order_on_an_ode_and_on_index_one(solver, kind):
+    system, end = dae_jax.ImplicitDAE(OSCILLATORS[kind]), 24.0
+    exact = np.array([np.sin(end), np.cos(end), np.cos(end)])
+    start = jnp.array([0.0, 1.0, 1.0])
+
+    def error(steps):
+        y0 = start[: 2 if kind == "ODE" else 3]
+        return np.abs(np.asarray(fixed(system, solver, end, steps, y0))[-1] - exact[: len(y0)]).max()
+
+    coarse, fine = {NINE: (20, 30), THIRTEEN: (9, 13)}[solver]
+    slope = np.log(error(coarse) / error(fine)) / np.log(fine / coarse)
+    order = solver.order(None)
+    assert order - 0.5 < slope < order + 1
+
+
+@BOTH
+def test_algebraic_variables_of_index_two_have_the_order_of_the_stages(solver):
+    scene = SCENES["hessenberg-2"]()
+    exact = [x[0] for x in scene.reference(np.array([scene.t1]))]
+
+    def error(steps):
+        x, z = fixed(scene.system, solver, scene.t1, steps, scene.y0)
+        return [np.abs(np.asarray(found)[-1] - known).max() for found, known in zip((x, z), exact, strict=True)]
+
+    coarse, fine = {NINE: (4, 8), THIRTEEN: (3, 4)}[solver]
+    far, near = error(coarse), error(fine)
+    assert np.log(far[1] / near[1]) / np.log(fine / coarse) > solver.stages - 0.35
+    # The differential ones superconverge.
+    assert near[0] < 1e-13 + 1e-3 * near[1]
+
+
+def test_fewer_steps_at_tight_tolerances():
+    """RadauIIA5 takes 3875, RadauIIA9 513."""
+    scene = SCENES["robertson"]()
+    sol = adaptive(scene.system, THIRTEEN, scene.t1, scene.y0, 1e-10, 1e-10 * scene.scale)
+    assert sol.stats["num_steps"] < 280
+    assert scene.error(np.array([scene.t1]), sol.ys) < 1e-11
+
+
+def test_the_stabilised_form_keeps_both_levels():
+    scene = SCENES["pendulum"]()
+    sol = adaptive(scene.system, THIRTEEN, 20.0, scene.y0, 1e-10, saveat=diffrax.SaveAt(steps=True))
+    off, taken = dae_jax.drift(scene.system, sol), np.isfinite(sol.ts)
+    assert max(off.position[taken].max(), off.velocity[taken].max()) < 1e-11
+
+
+@pytest.mark.parametrize(
+    ("solver", "residual"),
+    [
+        (NINE, lambda t, y, yd, args: [yd[0] + y[0], y[1] - 20 * jnp.cos(20 * t)]),
+        (THIRTEEN, lambda t, y, yd, args: [yd[0] - y[1] + 20 * jnp.cos(20 * t), y[0] - jnp.exp(-t)]),
+    ],
+    ids=["9, index 1", "13, index 2"],
+)
+def test_between_steps_errors_follow_the_tolerance(solver, residual):
+    times = np.linspace(0, 2, 301)
+    z = 20 * np.cos(20 * times) - (np.exp(-times) if solver is THIRTEEN else 0)
+    start = jnp.array([1.0, z[0]])
+    sol = adaptive(dae_jax.ImplicitDAE(residual), solver, 2.0, start, saveat=diffrax.SaveAt(ts=times))
+    np.testing.assert_allclose(sol.ys[:, 0], np.exp(-times), atol=3e-7)
+    np.testing.assert_allclose(sol.ys[:, 1], z, atol=20 * 3e-7)
+    assert sol.stats["num_steps"] < 150
+
+
+def reaction(k):
+    """Robertson's, with its conservation of mass."""
+    f = lambda t, x, z, k: jnp.stack(
+        [-k[0] * x[0] + k[1] * x[1] * z[0], k[0] * x[0] - k[1] * x[1] * z[0] - k[2] * x[1] ** 2]
+    )
+    system = dae_jax.SemiExplicitDAE(f, lambda t, x, z, k: jnp.stack([x[0] + x[1] + z[0] - 1]))
+    return system, (jnp.array([1.0, 0.0]), jnp.zeros(1)), jnp.array([0.04, 1e4, 3e7]) * k
+
+
+def test_gradients_and_a_batch():
+    def end(k, adjoint):
+        system, y0, rates = reaction(k)
+        return adaptive(system, NINE, 40.0, y0, 1e-9, 1e-13, rates, adjoint=adjoint, max_steps=1000).ys[1][-1, 0]
+
+    reverse, forward = diffrax.RecursiveCheckpointAdjoint(), diffrax.ForwardMode()
+    k, along, h = jnp.array([1.0, 1.1, 0.9]), jnp.array([0.3, -0.5, 1.0]), 1e-4
+    batch = jax.vmap(lambda k: end(k, reverse))(jnp.stack([k, k + h * along, k - h * along]))
+    value, change = jax.jvp(lambda k: end(k, forward), (k,), (along,))
+    np.testing.assert_allclose(batch[0], value, rtol=1e-12)
+    np.testing.assert_allclose(jax.grad(lambda k: end(k, reverse))(k) @ along, change, rtol=1e-8)
+    np.testing.assert_allclose(change, (batch[1] - batch[2]) / (2 * h), rtol=1e-5)
+
+
+def test_float32_and_backwards():
+    """ẏ = z, 0 = z + y: y = e^(1 − t)."""
+    system = dae_jax.SemiExplicitDAE(lambda t, x, z, a: z, lambda t, x, z, a: z + x)
+    start = (jnp.ones(1, jnp.float32), -jnp.ones(1, jnp.float32))
+    sol = dae_jax.daesolve(
+        system, THIRTEEN, 1.0, 0.0, None, start, saveat=diffrax.SaveAt(ts=jnp.array([0.6, 0.0])),
+        stepsize_controller=diffrax.PIDController(rtol=1e-4, atol=1e-4),
+    )  # fmt: skip
+    assert sol.ys[0].dtype == jnp.float32
+    np.testing.assert_allclose(sol.ys[0][:, 0], np.exp([0.4, 1.0]), rtol=3e-4)
+
+
+def test_a_solution_that_blows_up_is_named():
+    sol = adaptive(dae_jax.ImplicitDAE(lambda t, y, yd, a: yd - y**2), THIRTEEN, 2.0, jnp.ones(1), throw=False)
+    assert sol.result == dae_jax.RESULTS.error_too_large
