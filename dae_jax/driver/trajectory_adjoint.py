@@ -158,7 +158,13 @@ def cotangents(
             history = jax.tree.map(lambda x, y: jnp.where(k == 0, x, y), begin, before)
         known = _entry(between, k)
         (_, _, moving), pull_back, fixed = jax.vjp(
-            lambda *of: step(*of, known), numbers, _entry(points, k), history, times[k], times[k + 1], has_aux=True
+            lambda n, y, history, a, b: step(n, y, history, a, b, known),
+            numbers,
+            _entry(points, k),
+            history,
+            times[k],
+            times[k + 1],
+            has_aux=True,
         )
         of_dense, of_a, of_b = _zeros(moving), jnp.zeros_like(of_t0), jnp.zeros_like(of_t0)
         if save_times.size:

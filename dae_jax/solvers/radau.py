@@ -1,9 +1,8 @@
 """Radau IIA with three, five and seven stages for 0 = F(t, y, ẏ)."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -29,6 +28,13 @@ from .residual_steps import (
     start_of,
     tolerances,
 )
+
+
+# As equinox has it.
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractClassVar
+else:
+    from equinox import AbstractClassVar
 
 
 # The Jacobian is kept for the next step while Newton's method contracts faster than this.
@@ -60,7 +66,7 @@ class _State(NamedTuple):
 class AbstractRadauIIA(Replayable, AbstractResidualSolver):
     """The Radau IIA method with `stages` stages."""
 
-    stages: eqx.AbstractClassVar[int]
+    stages: AbstractClassVar[int]
 
     highest_index = 3
     default_index = 2
@@ -181,7 +187,7 @@ class RadauIIA5(AbstractRadauIIA):
     Methods*, table 2.3, for the orders.
     """
 
-    stages = 3
+    stages: ClassVar[int] = 3
 
 
 class RadauIIA9(AbstractRadauIIA):
@@ -199,7 +205,7 @@ class RadauIIA9(AbstractRadauIIA):
     the program RADAU.
     """
 
-    stages = 5
+    stages: ClassVar[int] = 5
 
 
 class RadauIIA13(AbstractRadauIIA):
@@ -216,7 +222,7 @@ class RadauIIA13(AbstractRadauIIA):
     Source: as for `RadauIIA9`.
     """
 
-    stages = 7
+    stages: ClassVar[int] = 7
 
 
 def _predicted(state: _State, h: Any) -> Float[Array, "s n"]:

@@ -99,14 +99,17 @@ class SelectedResiduals(Replayable, AbstractResidualSolver):
         return y1, error, dense, Selection(inner, directions, solver_state.switches + switched), result
 
     def history_at_start(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Any:
-        return self.solver.history_at_start(terms, t0, t1, y0, args)
+        solver: Any = self.solver
+        return solver.history_at_start(terms, t0, t1, y0, args)
 
     def history_after(self, dense: Any) -> Any:
-        return self.solver.history_after(dense["inner"])
+        solver: Any = self.solver
+        return solver.history_after(dense["inner"])
 
     def replay(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, history: Any, dense: Any) -> Any:
+        solver: Any = self.solver
         linearised = _selected(args, dense["directions"])
-        y1, history, inner = self.solver.replay(terms, t0, t1, y0, linearised, history, dense["inner"])
+        y1, history, inner = solver.replay(terms, t0, t1, y0, linearised, history, dense["inner"])
         return y1, history, {**dense, "inner": inner}
 
 
