@@ -11,6 +11,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ..linalg import implicit_root, rms_norm
+from ..types import BoolLike, Time
 from .manifold import time_sign
 from .replay import Replayable
 from .residual_steps import (
@@ -56,7 +57,7 @@ class NewtonPolynomial(diffrax.AbstractLocalInterpolation):
     jumped: Any
     first: Any
 
-    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Any:
+    def evaluate(self, t0: Time, t1: Any = None, left: bool = True) -> Any:
         """The value at `t0`, or the increment from there to `t1`."""
         if t1 is not None:
             return self.evaluate(t1) - self.evaluate(t0)
@@ -161,13 +162,13 @@ class BDF(Replayable, AbstractResidualSolver):
     default_index = 1
     interpolation_cls = NewtonPolynomial
 
-    def order(self, terms: Any) -> int:
+    def order(self, terms: diffrax.AbstractTerm) -> int:
         return MAX_ORDER
 
-    def error_order(self, terms: Any) -> int:
+    def error_order(self, terms: diffrax.AbstractTerm) -> int:
         return ERROR_ORDER
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> _State:
+    def init(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any) -> _State:
         sign = time_sign(terms, t0, t1)
         like = _Step(args, sign, t1, t1 - t0, 1 / (t1 - t0), y0, y0)
         tol = tolerances(self.rtol, self.atol, y0.dtype)
@@ -177,7 +178,16 @@ class BDF(Replayable, AbstractResidualSolver):
     def invalidate_jacobian(self, state: _State) -> _State:
         return state._replace(c=jnp.zeros_like(state.c))
 
-    def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: _State, made_jump: Any) -> Any:
+    def step(
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: Time,
+        t1: Time,
+        y0: Any,
+        args: Any,
+        solver_state: _State,
+        made_jump: BoolLike,
+    ) -> Any:
         # A lane of a batch that has ended goes on with steps of length 0, whose derivatives are multiplied by 0.
         h = jnp.where(t1 == t0, 1, t1 - t0)
         sign, state = time_sign(terms, t0, t1), solver_state
@@ -219,14 +229,16 @@ class BDF(Replayable, AbstractResidualSolver):
         dense = {"phi": phi, "psi": method.psi, **dict(zip(("order", "jumped", "first"), marks, strict=True))}
         return y1, error, dense, new, result
 
-    def history_at_start(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Any:
+    def history_at_start(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any) -> Any:
         start = _start(time_sign(terms, t0, t1) * args.start, None)
         return start.phi, start.psi
 
     def history_after(self, dense: Any) -> Any:
         return jnp.where(dense["jumped"] > 0, 0, dense["phi"][1:]), dense["psi"]
 
-    def replay(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, history: Any, dense: Any) -> Any:
+    def replay(
+        self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any, history: Any, dense: Any
+    ) -> Any:
         h, sign, k = jnp.where(t1 == t0, 1, t1 - t0), time_sign(terms, t0, t1), dense["order"].astype(int)
         phi, psi = history
         method = _formula(k, dense["first"] > 0, psi, h)
@@ -238,7 +250,7 @@ class BDF(Replayable, AbstractResidualSolver):
 
 
 def _predicted(
-    method: "_Formula", k: Any, phi: Any, args: Any, sign: Any, t1: Any, h: Any, y0: Any
+    method: "_Formula", k: Any, phi: Any, args: Any, sign: Any, t1: Time, h: Any, y0: Any
 ) -> tuple[_Step, list[Any]]:
     """The equation of a step of order k, and the differences that predict it."""
     star = [y0] + [b * row for b, row in zip(method.beta[1:], phi, strict=True)]

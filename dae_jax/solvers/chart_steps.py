@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from ..types import BoolLike, Time
 from ..validate.states import brief
 from .abilities import is_explicit
 from .explicit import identity, unrolled
@@ -32,7 +33,7 @@ class _Interpolation(diffrax.AbstractLocalInterpolation):
     normals: Any
     cls: Any = eqx.field(static=True)
 
-    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Any:
+    def evaluate(self, t0: Time, t1: Any = None, left: bool = True) -> Any:
         if t1 is not None:
             return jax.tree.map(lambda a, b: b - a, self.evaluate(t0), self.evaluate(t1))
         return TangentPoint(self.cls(t0=self.t0, t1=self.t1, **self.inner).evaluate(t0), self.normals)
@@ -62,14 +63,22 @@ class AbstractChartSolver(AbstractManifoldSolver, diffrax.AbstractAdaptiveSolver
         inner = self.solver.interpolation_cls
         return lambda t0, t1, inner_info, normals: _Interpolation(t0, t1, inner_info, normals, inner)
 
-    def order(self, terms: Any) -> Any:
+    def order(self, terms: diffrax.AbstractTerm) -> Any:
         return self.solver.order(terms)
 
-    def error_order(self, terms: Any) -> Any:
+    def error_order(self, terms: diffrax.AbstractTerm) -> Any:
         return self.solver.error_order(terms)
 
     def step_in(
-        self, chart: Any, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, derivative: Any, made_jump: Any
+        self,
+        chart: Any,
+        terms: diffrax.AbstractTerm,
+        t0: Time,
+        t1: Time,
+        y0: Any,
+        args: Any,
+        derivative: Any,
+        made_jump: BoolLike,
     ) -> Any:
         """The step in the chart in which a point moves along `chart` on to the manifold; `derivative` is ẏ at y₀."""
         sign = time_sign(terms, t0, t1)
@@ -110,7 +119,7 @@ class _Controlled(eqx.Module):
     def vf(self, t: Any, y: Any, args: Any) -> Any:
         return self.term.vf(t, y, args)
 
-    def contr(self, t0: Any, t1: Any) -> Any:
+    def contr(self, t0: Time, t1: Any) -> Any:
         return self.outer.contr(t0, t1)
 
 
@@ -124,7 +133,7 @@ def _jumps(y0: Any, y1: Any, start: Any, end: Any, h: Any) -> Any:
     return largest(y1 - y0) > allowed + SPEEDS * jnp.abs(h) * (largest(start) + largest(end))
 
 
-def _field(terms: Any, sign: Any, ode: Any, chart: Any, t: Any, u: Any) -> Any:
+def _field(terms: diffrax.AbstractTerm, sign: Any, ode: Any, chart: Any, t: Any, u: Any) -> Any:
     y, found = ode.retract_along(sign * t, u, chart)
     dy = ode.tangent(terms.vf(t, y, ode), chart)
     return or_nan(jnp.asarray(found), dy), y

@@ -11,6 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from ..compiler import is_large, scalarise, subroutine
+from ..types import BoolLike, Time
 
 
 # A larger state goes through the stages in a loop, as one with a large field does: compiling takes a quarter of the time.
@@ -58,7 +59,7 @@ def stage_slopes(
     return fs
 
 
-def _slopes_in_a_loop(a: Any, c: Any, field: Any, t0: Any, t1: Any, h: Any, y0: Any, f0: Any) -> list[Any]:
+def _slopes_in_a_loop(a: Any, c: Any, field: Any, t0: Time, t1: Time, h: Any, y0: Any, f0: Any) -> list[Any]:
     # Of each row the coefficients that are not zero, and where they are; rows are filled up with zeros.
     used = [np.flatnonzero(row) for row in a]
     longest = max(map(len, used))
@@ -82,7 +83,7 @@ def _slopes_in_a_loop(a: Any, c: Any, field: Any, t0: Any, t1: Any, h: Any, y0: 
 class Flat:
     """The field, the state and `retract` of a step on one vector, in which every linear combination is one loop."""
 
-    def __init__(self, terms: Any, t0: Any, y0: Any, args: Any, retract: Callable[..., Any]) -> None:
+    def __init__(self, terms: diffrax.AbstractTerm, t0: Time, y0: Any, args: Any, retract: Callable[..., Any]) -> None:
         self.y0, self.tree = ravel_pytree(y0)
         self.field = subroutine(scalarise(lambda t, y: self.vector(terms.vf(t, self.tree(y), args))))
         self._retract = retract
@@ -123,24 +124,41 @@ class Unrolled(diffrax.AbstractWrappedSolver):
     def scan_kind(self) -> Any:
         return self.solver.scan_kind
 
-    def order(self, terms: Any) -> Any:
+    def order(self, terms: diffrax.AbstractTerm) -> Any:
         return self.solver.order(terms)
 
-    def error_order(self, terms: Any) -> Any:
+    def error_order(self, terms: diffrax.AbstractTerm) -> Any:
         return self.solver.error_order(terms)
 
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+    def func(self, terms: diffrax.AbstractTerm, t0: Time, y0: Any, args: Any) -> Any:
         return terms.vf(t0, y0, args)
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Any:
+    def init(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any) -> Any:
         return terms.vf(t0, y0, args) if self.solver.tableau.fsal else None
 
-    def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any) -> Any:
+    def step(
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: Time,
+        t1: Time,
+        y0: Any,
+        args: Any,
+        solver_state: Any,
+        made_jump: BoolLike,
+    ) -> Any:
         *step, _ = self.step_and_retract(terms, t0, t1, y0, args, solver_state, made_jump, identity)
         return *step, diffrax.RESULTS.successful
 
     def step_and_retract(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, state: Any, made_jump: Any, retract: Callable[..., Any]
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: Time,
+        t1: Time,
+        y0: Any,
+        args: Any,
+        state: Any,
+        made_jump: BoolLike,
+        retract: Callable[..., Any],
     ) -> Any:
         """`step`, with its end moved to `retract(t1, y1)` → (y1, found)."""
         tableau = self.solver.tableau
@@ -176,7 +194,7 @@ def with_retraction(error: Array, ahead: Array, retracted: Array) -> Array:
     return jnp.where(jnp.abs(moved) > jnp.maximum(jnp.abs(error), allowed), moved, error)
 
 
-def first_derivative(flat: Flat, t0: Any, state: Any, made_jump: Any) -> Any:
+def first_derivative(flat: Flat, t0: Time, state: Any, made_jump: BoolLike) -> Any:
     """f(t₀, y₀), from the last step where that left it."""
     if state is None or made_jump is True:
         return flat.field(t0, flat.y0)

@@ -7,6 +7,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from ..types import BoolLike, Time
+
 
 class WithoutFailedSteps(diffrax.AbstractWrappedSolver):
     """`solver` for reverse derivatives.
@@ -25,19 +27,28 @@ class WithoutFailedSteps(diffrax.AbstractWrappedSolver):
     def interpolation_cls(self) -> Any:
         return self.solver.interpolation_cls
 
-    def order(self, terms: Any) -> Any:
+    def order(self, terms: diffrax.AbstractTerm) -> Any:
         return self.solver.order(terms)
 
-    def error_order(self, terms: Any) -> Any:
+    def error_order(self, terms: diffrax.AbstractTerm) -> Any:
         return self.solver.error_order(terms)
 
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+    def func(self, terms: diffrax.AbstractTerm, t0: Time, y0: Any, args: Any) -> Any:
         return self.solver.func(terms, t0, y0, args)
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Any:
+    def init(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any) -> Any:
         return self.solver.init(terms, t0, t1, y0, args)
 
-    def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any) -> Any:
+    def step(
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: Time,
+        t1: Time,
+        y0: Any,
+        args: Any,
+        solver_state: Any,
+        made_jump: BoolLike,
+    ) -> Any:
         arrays, rest = eqx.partition((self.solver, terms, t0, t1, y0, args, solver_state, made_jump), eqx.is_array)
         numbers, others = eqx.partition(arrays, eqx.is_inexact_array)
         static: list[Any] = []

@@ -6,6 +6,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 
+from ..types import BoolLike, Time
 from ..validate.states import brief
 from .abilities import is_recomputable
 from .explicit import unrolled, with_retraction
@@ -67,19 +68,28 @@ class OrthogonalProjection(diffrax.AbstractWrappedSolver, AbstractManifoldSolver
     def root_find_max_steps(self) -> Any:
         return self.solver.root_find_max_steps  # pyright: ignore[reportAttributeAccessIssue]
 
-    def order(self, terms: Any) -> Any:
+    def order(self, terms: diffrax.AbstractTerm) -> Any:
         return self.solver.order(terms)
 
-    def error_order(self, terms: Any) -> Any:
+    def error_order(self, terms: diffrax.AbstractTerm) -> Any:
         return self.solver.error_order(terms)
 
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+    def func(self, terms: diffrax.AbstractTerm, t0: Time, y0: Any, args: Any) -> Any:
         return self.solver.func(terms, t0, y0, args)
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Any:
+    def init(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any) -> Any:
         return unrolled(self.solver).init(terms, t0, t1, y0, args)
 
-    def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any) -> Any:
+    def step(
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: Time,
+        t1: Time,
+        y0: Any,
+        args: Any,
+        solver_state: Any,
+        made_jump: BoolLike,
+    ) -> Any:
         solver = unrolled(self.solver)
         sign = time_sign(terms, t0, t1)
 

@@ -3,12 +3,14 @@
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
+import diffrax
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..linalg import implicit_root
+from ..types import BoolLike, Time
 from .manifold import time_sign
 from .radau_coefficients import Coefficients, coefficients
 from .radau_step import CollocationPolynomial, Step, along, coupled, linear_solve
@@ -74,17 +76,17 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
 
     dense: bool = True
 
-    def order(self, terms: Any) -> int:
+    def order(self, terms: diffrax.AbstractTerm) -> int:
         return 2 * self.stages - 1
 
-    def error_order(self, terms: Any) -> int:
+    def error_order(self, terms: diffrax.AbstractTerm) -> int:
         return self.stages + 1
 
     def _tolerances(self, dtype: Any) -> Tolerances:
         tol = tolerances(self.rtol, self.atol, dtype)
         return tol._replace(corrections=tol.corrections + int(PATIENCE * (self.stages - 3)))
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> _State:
+    def init(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any) -> _State:
         sign = time_sign(terms, t0, t1)
         zero = jnp.zeros((), y0.dtype)
         step = Step(coefficients(self.stages), args, sign, t0, t1, y0)
@@ -105,7 +107,16 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
     def invalidate_jacobian(self, state: _State) -> _State:
         return state._replace(refresh=jnp.ones_like(state.refresh))
 
-    def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: _State, made_jump: Any) -> Any:
+    def step(
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: Time,
+        t1: Time,
+        y0: Any,
+        args: Any,
+        solver_state: _State,
+        made_jump: BoolLike,
+    ) -> Any:
         state = solver_state._replace(
             refresh=solver_state.refresh | made_jump, h=jnp.where(made_jump, 0, solver_state.h)
         )
@@ -130,7 +141,9 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
         new = _State(z, size, rates, jacobians, factors, size, slow, newton.eta)
         return y1, scaled, {"y0": y0, "z": z}, constant(new), result
 
-    def replay(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, history: Any, dense: Any) -> Any:
+    def replay(
+        self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any, history: Any, dense: Any
+    ) -> Any:
         step = Step(coefficients(self.stages), args, time_sign(terms, t0, t1), t0, t1, y0)
         z, _ = _stages(lambda params: (params[1], ()), (step, constant(dense["z"])))
         return y0 + z[-1], history, {"y0": y0, "z": z}

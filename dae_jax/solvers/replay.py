@@ -2,6 +2,10 @@
 
 from typing import Any
 
+import diffrax
+
+from ..types import Time
+
 
 class Replayable:
     """A solver whose accepted steps can be replayed without an iteration: their dense output holds what was found.
@@ -9,7 +13,7 @@ class Replayable:
     A step is a function of its start y₀, its times, the problem, and a `history`: numbers that the step before it left.
     """
 
-    def history_at_start(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Any:
+    def history_at_start(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any) -> Any:
         """The history before the first step."""
         return ()
 
@@ -18,7 +22,7 @@ class Replayable:
         return ()
 
     def replay(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, history: Any, dense: Any
+        self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any, history: Any, dense: Any
     ) -> tuple[Any, Any, Any]:
         """(y₁, history, dense output) of the step with this dense output, with their derivatives."""
         raise NotImplementedError

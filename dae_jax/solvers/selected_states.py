@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from ..types import BoolLike, Time
 from .chart_steps import AbstractChartSolver
 from .manifold import or_nan, outcome, time_sign
 from .replay import Replayable
@@ -32,11 +33,20 @@ class SelectedStates(Replayable, AbstractChartSolver):
     recomputable: ClassVar[bool] = False
     counts: ClassVar[tuple[str, ...]] = ("switches",)
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Selection:
+    def init(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any) -> Selection:
         directions, _ = args.selection(time_sign(terms, t0, t1) * t0, y0, None)
         return Selection(terms.vf(t0, y0, args), directions, jnp.asarray(0))
 
-    def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Selection, made_jump: Any) -> Any:
+    def step(
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: Time,
+        t1: Time,
+        y0: Any,
+        args: Any,
+        solver_state: Selection,
+        made_jump: BoolLike,
+    ) -> Any:
         directions, switched = args.selection(time_sign(terms, t0, t1) * t0, y0, solver_state.directions)
         y1, error, dense, derivative, result = self.step_in(
             directions, terms, t0, t1, y0, args, solver_state.inner, made_jump
@@ -49,7 +59,9 @@ class SelectedStates(Replayable, AbstractChartSolver):
             result = diffrax.RESULTS.where(stays, result, outcome(stays))
         return y1, error, dense, Selection(derivative, directions, solver_state.switches + switched), result
 
-    def replay(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, history: Any, dense: Any) -> Any:
+    def replay(
+        self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any, history: Any, dense: Any
+    ) -> Any:
         derivative = terms.vf(t0, y0, args)
         y1, _, dense, *_ = self.step_in(dense["normals"], terms, t0, t1, y0, args, derivative, False)
         return y1, history, dense
@@ -71,19 +83,28 @@ class SelectedResiduals(Replayable, AbstractResidualSolver):
     def interpolation_cls(self) -> Any:
         return lambda t0, t1, inner, directions: self.solver.interpolation_cls(t0=t0, t1=t1, **inner)
 
-    def order(self, terms: Any) -> Any:
+    def order(self, terms: diffrax.AbstractTerm) -> Any:
         return self.solver.order(terms)
 
-    def error_order(self, terms: Any) -> Any:
+    def error_order(self, terms: diffrax.AbstractTerm) -> Any:
         return self.solver.error_order(terms)
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Selection:
+    def init(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any) -> Selection:
         return Selection(self.solver.init(terms, t0, t1, y0, args), constant(args.form.directions), jnp.asarray(0))
 
     def invalidate_jacobian(self, state: Selection) -> Selection:
         return state._replace(inner=self.solver.invalidate_jacobian(state.inner))
 
-    def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Selection, made_jump: Any) -> Any:
+    def step(
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: Time,
+        t1: Time,
+        y0: Any,
+        args: Any,
+        solver_state: Selection,
+        made_jump: BoolLike,
+    ) -> Any:
         ode = args.form.ode
         directions, switched = ode.selection(
             time_sign(terms, t0, t1) * t0, y0[: ode.orders.size], solver_state.directions
@@ -98,7 +119,7 @@ class SelectedResiduals(Replayable, AbstractResidualSolver):
         dense = {"inner": dense, "directions": directions}
         return y1, error, dense, Selection(inner, directions, solver_state.switches + switched), result
 
-    def history_at_start(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Any:
+    def history_at_start(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any) -> Any:
         solver: Any = self.solver
         return solver.history_at_start(terms, t0, t1, y0, args)
 
@@ -106,7 +127,9 @@ class SelectedResiduals(Replayable, AbstractResidualSolver):
         solver: Any = self.solver
         return solver.history_after(dense["inner"])
 
-    def replay(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, history: Any, dense: Any) -> Any:
+    def replay(
+        self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any, history: Any, dense: Any
+    ) -> Any:
         solver: Any = self.solver
         linearised = _selected(args, dense["directions"])
         y1, history, inner = solver.replay(terms, t0, t1, y0, linearised, history, dense["inner"])
