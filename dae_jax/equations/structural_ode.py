@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..linalg import (
     Tearing,
+    determinant_sign,
     fixed_point,
     implicit_root,
     relative_change,
@@ -302,7 +303,7 @@ class StructuralODE(ManifoldODE):
             rows, place = self.orders.rows(k - 1), self.orders.dummies(k)
             directions = chosen[first : first + len(rows)]
             columns = jnp.where(jnp.asarray(place >= 0), directions[:, np.maximum(place, 0)], 0)
-            signs.append(jnp.linalg.slogdet(row_products(matrix[rows], columns))[0])
+            signs.append(determinant_sign(row_products(matrix[rows], columns)))
             first += len(rows)
         return jnp.stack(signs)
 

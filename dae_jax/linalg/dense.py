@@ -36,23 +36,40 @@ def row_products(a: Float[Array, "m n"], b: Float[Array, "k n"]) -> Float[Array,
     return jnp.sum(a[:, None] * b, -1)
 
 
+def determinant_sign(a: Float[Array, "n n"]) -> Float[Array, ""]:
+    """The sign of det A, 0 of a singular A, by elimination with partial pivoting in plain arithmetic; LAPACK above 32 rows."""
+    if len(a) > LOOPED:
+        return jnp.linalg.slogdet(a)[0]
+
+    def eliminate(j: IntScalar, carry: tuple[Float[Array, "n n"], Float[Array, ""]]):
+        a, sign = carry
+        a, pivot = _eliminated(a, j)
+        return jnp.where(pivot == 0, 0, a), sign * jnp.sign(pivot)
+
+    return lax.fori_loop(0, len(a), eliminate, (a, jnp.ones((), a.dtype)))[1]
+
+
 def _gauss_jordan(a: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:
-    n = a.shape[0]
-    rows = jnp.arange(n)
-
-    def eliminate(j: IntScalar, augmented):
-        column = lax.dynamic_slice_in_dim(augmented, j, 1, 1)
-        pivot = jnp.argmax(jnp.where(rows >= j, jnp.abs(column[:, 0]), -1))
-        at_j, at_pivot = (rows == j)[:, None], (rows == pivot)[:, None]
-        row_j = lax.dynamic_slice_in_dim(augmented, j, 1, 0)
-        row_pivot = lax.dynamic_slice_in_dim(augmented, pivot, 1, 0)
-        swapped = jnp.where(at_j, row_pivot, jnp.where(at_pivot, row_j, augmented))
-        column = lax.dynamic_slice_in_dim(swapped, j, 1, 1)
-        row = row_pivot / lax.dynamic_slice_in_dim(row_pivot, j, 1, 1)
-        return jnp.where(at_j, row, swapped - column * row)
-
-    augmented = lax.fori_loop(0, n, eliminate, jnp.concatenate([a, b[:, None]], 1))
+    n = len(a)
+    augmented = lax.fori_loop(0, n, lambda j, x: _eliminated(x, j)[0], jnp.concatenate([a, b[:, None]], 1))
     return augmented[:, n]
+
+
+def _eliminated(a: Float[Array, "n k"], j: IntScalar) -> tuple[Float[Array, "n k"], Float[Array, ""]]:
+    """A with column j eliminated by its largest element of the rows from j on, which is in row j then, and this pivot, with
+    the other sign where two rows had to change places.
+    """
+    rows = jnp.arange(len(a))
+    column = lax.dynamic_slice_in_dim(a, j, 1, 1)
+    place = jnp.argmax(jnp.where(rows >= j, jnp.abs(column[:, 0]), -1))
+    at_j, at_pivot = (rows == j)[:, None], (rows == place)[:, None]
+    row_j = lax.dynamic_slice_in_dim(a, j, 1, 0)
+    row_pivot = lax.dynamic_slice_in_dim(a, place, 1, 0)
+    swapped = jnp.where(at_j, row_pivot, jnp.where(at_pivot, row_j, a))
+    column = lax.dynamic_slice_in_dim(swapped, j, 1, 1)
+    pivot = lax.dynamic_slice_in_dim(row_pivot, j, 1, 1)
+    row = row_pivot / pivot
+    return jnp.where(at_j, row, swapped - column * row), jnp.where(place == j, 1, -1) * pivot[0, 0]
 
 
 def _unrolled(a: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:

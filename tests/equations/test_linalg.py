@@ -9,7 +9,17 @@ import optimistix
 import pytest
 
 from dae_jax.compiler import hindrances
-from dae_jax.linalg import SmallCholesky, SmallLU, elimination, newton, rms_norm, semidefinite_solve, solve, tearing
+from dae_jax.linalg import (
+    SmallCholesky,
+    SmallLU,
+    determinant_sign,
+    elimination,
+    newton,
+    rms_norm,
+    semidefinite_solve,
+    solve,
+    tearing,
+)
 from dae_jax.linalg.semidefinite import LOOPED, UNROLLED
 
 
@@ -143,6 +153,26 @@ def circle_and_line(x, p):
 
 def cube(x, p):
     return x**3 - p
+
+
+class TestDeterminantSign:
+    @pytest.mark.parametrize("n", ONE_OF_EACH)
+    def test_equals_numpy(self, n):
+        found = []
+        for seed in range(12):
+            a = right(n, n, seed=seed)
+            a[0, 0] = 0
+            found.append(float(determinant_sign(jnp.asarray(a))))
+            assert found[-1] == np.linalg.slogdet(a)[0]
+        assert set(found) == {1.0, -1.0}
+
+    @pytest.mark.parametrize("n", [1, 4])
+    def test_of_a_singular_matrix_and_of_no_numbers(self, n):
+        a = np.eye(n)
+        a[-1] = 0
+        assert determinant_sign(jnp.asarray(a)) == 0
+        a[0, -1] = np.nan
+        assert jnp.isnan(determinant_sign(jnp.asarray(a)))
 
 
 class TestNewton:

@@ -185,19 +185,14 @@ class TestWeights:
 
 
 class TestBDF:
-    def _state(self, order, psi, phi):
-        filled = np.zeros((5, 1))
-        filled[: len(phi), 0] = phi
-        start = bdf._start(jnp.zeros(1), None)
-        return start._replace(
-            phi=jnp.asarray(filled), psi=jnp.asarray(psi), steps=jnp.asarray(9), order=jnp.asarray(order)
-        )
+    def _formula(self, order, psi, h):
+        return bdf._formula(jnp.asarray(order), jnp.asarray(False), jnp.asarray(psi), jnp.asarray(h))
 
     @pytest.mark.parametrize("k", range(1, 6))
     def test_of_equal_steps(self, k):
         """c = Σ 1/j h⁻¹; the error of order j is y − y* over j + 1."""
         h = 0.3
-        found = bdf._formula(self._state(k, h * np.arange(1.0, 7), []), jnp.asarray(h))
+        found = self._formula(k, h * np.arange(1.0, 7), h)
         harmonic = np.cumsum(1 / np.arange(1, 6))
         np.testing.assert_allclose(found.beta, 1, rtol=1e-14)
         np.testing.assert_allclose(found.gamma, np.append(0, harmonic) / h, rtol=1e-14)
@@ -213,7 +208,7 @@ class TestBDF:
         for j in range(1, 4):
             differences = np.diff(differences) / -(before[j:] - before[:-j])
             phi.append(differences[0] * np.prod(before[1 : j + 1]))
-        found = bdf._formula(self._state(3, before[1:], phi[1:]), jnp.asarray(h))
+        found = self._formula(3, before[1:], h)
         star = np.array(found.beta[:4]) * phi
         np.testing.assert_allclose(star.sum(), cubic(h), rtol=1e-13)
         np.testing.assert_allclose(np.array(found.gamma[:4]) @ star, cubic.deriv()(h), rtol=1e-13)
