@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..linalg import (
     Tearing,
+    amplified_roundoff,
     determinant_sign,
     fixed_point,
     implicit_root,
@@ -42,6 +43,8 @@ STARTING = 100
 FREE = 1e3
 # A selection of states is kept until its smallest pivot is less than this part of the best one's.
 HYSTERESIS = 0.3
+# What of H may be round-off, in parts of its terms and of the resolution of numbers.
+OFF = 1000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -244,15 +247,18 @@ class StructuralODE(ManifoldODE):
     ) -> tuple[Any, Bool[Array, ""]]:
         if not len(normals):
             return y, jnp.asarray(True)
+        noise, amplified = OFF * float(jnp.finfo(y.dtype).eps), amplified_roundoff(y.dtype)
 
         def iterate(params: PyTree) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
             ode, t, y, normals = params
 
             def correct(mu: Float[Array, " m"]) -> tuple[Any, Any]:
                 here = ode.displace(y, normals, mu)
-                matrix = row_products(ode.normals(t, here), normals)
-                delta = solve(matrix, ode.violations(t, here))
-                return mu - delta, relative_change(ode.displace(0, normals, delta), here)
+                off, across = ode.violations(t, here), ode.normals(t, here)
+                delta = solve(row_products(across, normals), off)
+                size = relative_change(ode.displace(0, normals, delta), here)
+                settled = jnp.all(jnp.abs(off) <= noise * row_products(jnp.abs(across), jnp.abs(here)[None])[:, 0])
+                return mu - delta, jnp.where(settled & (size < amplified), 0, size)
 
             return fixed_point(correct, jnp.zeros(len(normals), y.dtype))
 

@@ -4,6 +4,7 @@ from .dense import determinant_sign as determinant_sign, row_products as row_pro
 from .elimination import Elimination as Elimination, elimination as elimination, take as take
 from .lineax_solvers import SmallCholesky as SmallCholesky, SmallLU as SmallLU
 from .newton import (
+    amplified_roundoff as amplified_roundoff,
     fixed_point as fixed_point,
     implicit_root as implicit_root,
     newton as newton,

@@ -25,6 +25,13 @@ def roundoff(dtype: DType) -> float:
     return 4 * float(jnp.finfo(dtype).eps)
 
 
+def amplified_roundoff(dtype: DType) -> float:
+    """What corrections of a residual that is round-off may be, relative to 1 + the size of the unknowns, near a singular
+    point, where it is amplified so much that they end below this without shrinking to less.
+    """
+    return float(jnp.finfo(dtype).eps) ** 0.55
+
+
 def relative_change(delta: Float[Array, " n"], x: Float[Array, " n"]) -> Float[Array, ""]:
     """The size of a correction `delta` relative to 1 + the size of `x`, in the maximum norm."""
     return jnp.max(jnp.abs(delta), initial=0.0) / (1 + jnp.max(jnp.abs(x), initial=0.0))
@@ -77,9 +84,8 @@ def fixed_point(
     tolerance = roundoff(dtype)
     one = jnp.ones((), dtype)
     proves_nothing = last is None
-    # Near a singular point round-off is amplified so much that corrections end below this without shrinking to less.
-    # So they do where an equation is steep, and there they are no proof.
-    noise = 0.0 if proves_nothing else float(jnp.finfo(dtype).eps) ** 0.55
+    # Where an equation is steep corrections are as small without being round-off.
+    noise = 0.0 if proves_nothing else amplified_roundoff(dtype)
 
     def stagnant(last: Any, previous: Any, turned: Any) -> Any:
         # Round-off has no direction; corrections that go on in one are on their way down an equation that is steep.
