@@ -254,8 +254,9 @@ def _predicted(
 ) -> tuple[_Step, list[Any]]:
     """The equation of a step of order k, and the differences that predict it."""
     star = [y0] + [b * row for b, row in zip(method.beta[1:], phi, strict=True)]
-    y = sum(jnp.where(j <= k, row, 0) for j, row in enumerate(star))
-    rate = sum(jnp.where(j <= k, g * row, 0) for j, (g, row) in enumerate(zip(method.gamma, star, strict=True)))
+    zero = jnp.zeros_like(y0)
+    y = sum((jnp.where(j <= k, row, 0) for j, row in enumerate(star)), zero)
+    rate = sum((jnp.where(j <= k, g * row, 0) for j, (g, row) in enumerate(zip(method.gamma, star, strict=True))), zero)
     return _Step(args, sign, t1, h, method.c, y, rate), star
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Array
 
 from ..compiler import is_large, scalarise, subroutine
 from ..types import BoolLike, Time
+from .wrapping import AbstractWrapper
 
 
 # A larger state goes through the stages in a loop, as one with a large field does: compiling takes a quarter of the time.
@@ -102,7 +103,7 @@ class Flat:
         return self.vector(end), found
 
 
-class Unrolled(diffrax.AbstractWrappedSolver):
+class Unrolled(AbstractWrapper):
     """An explicit diffrax Runge–Kutta solver with its stages written out, equal to it up to round-off.
 
     The wrapped solver's tableau and interpolation are used as they are. `retract` is applied to the end of the step before
@@ -117,24 +118,20 @@ class Unrolled(diffrax.AbstractWrappedSolver):
         return diffrax.ODETerm
 
     @property
-    def interpolation_cls(self) -> Any:
-        return self.solver.interpolation_cls
+    def tableau(self) -> diffrax.ButcherTableau:
+        """The coefficients; a solver of several terms, which has several tableaus, is not wrapped."""
+        assert isinstance(self.solver.tableau, diffrax.ButcherTableau)
+        return self.solver.tableau
 
     @property
     def scan_kind(self) -> Any:
         return self.solver.scan_kind
 
-    def order(self, terms: diffrax.AbstractTerm) -> Any:
-        return self.solver.order(terms)
-
-    def error_order(self, terms: diffrax.AbstractTerm) -> Any:
-        return self.solver.error_order(terms)
-
     def func(self, terms: diffrax.AbstractTerm, t0: Time, y0: Any, args: Any) -> Any:
         return terms.vf(t0, y0, args)
 
     def init(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any) -> Any:
-        return terms.vf(t0, y0, args) if self.solver.tableau.fsal else None
+        return terms.vf(t0, y0, args) if self.tableau.fsal else None
 
     def step(
         self,
@@ -161,7 +158,7 @@ class Unrolled(diffrax.AbstractWrappedSolver):
         retract: Callable[..., Any],
     ) -> Any:
         """`step`, with its end moved to `retract(t1, y1)` → (y1, found)."""
-        tableau = self.solver.tableau
+        tableau = self.tableau
         h = terms.contr(t0, t1)
         flat = Flat(terms, t0, y0, args, retract)
         f0 = first_derivative(flat, t0, state, made_jump)

@@ -8,9 +8,10 @@ import jax
 import jax.numpy as jnp
 
 from ..types import BoolLike, Time
+from .wrapping import AbstractWrapper
 
 
-class WithoutFailedSteps(diffrax.AbstractWrappedSolver):
+class WithoutFailedSteps(AbstractWrapper):
     """`solver` for reverse derivatives.
 
     A step whose equations have no solution ends in NaN, is rejected, and has the cotangent 0; but 0 times the NaN inside
@@ -18,26 +19,6 @@ class WithoutFailedSteps(diffrax.AbstractWrappedSolver):
     """
 
     solver: diffrax.AbstractSolver
-
-    @property
-    def term_structure(self) -> Any:
-        return self.solver.term_structure
-
-    @property
-    def interpolation_cls(self) -> Any:
-        return self.solver.interpolation_cls
-
-    def order(self, terms: diffrax.AbstractTerm) -> Any:
-        return self.solver.order(terms)
-
-    def error_order(self, terms: diffrax.AbstractTerm) -> Any:
-        return self.solver.error_order(terms)
-
-    def func(self, terms: diffrax.AbstractTerm, t0: Time, y0: Any, args: Any) -> Any:
-        return self.solver.func(terms, t0, y0, args)
-
-    def init(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any) -> Any:
-        return self.solver.init(terms, t0, t1, y0, args)
 
     def step(
         self,

@@ -12,9 +12,10 @@ from .abilities import is_recomputable
 from .explicit import unrolled, with_retraction
 from .manifold import AbstractManifoldSolver, or_nan, outcome, time_sign
 from .residual_steps import AbstractResidualSolver
+from .wrapping import AbstractWrapper
 
 
-class OrthogonalProjection(diffrax.AbstractWrappedSolver, AbstractManifoldSolver):
+class OrthogonalProjection(AbstractWrapper, AbstractManifoldSolver):
     """A step of `solver`, then the nearest point with H = 0:
 
         ỹ = Φ_h(y₀),   y₁ = ỹ + N(ỹ) μ,   H(t₁, y₁) = 0,
@@ -49,14 +50,6 @@ class OrthogonalProjection(diffrax.AbstractWrappedSolver, AbstractManifoldSolver
         return is_recomputable(self.solver)
 
     @property
-    def term_structure(self) -> Any:
-        return self.solver.term_structure
-
-    @property
-    def interpolation_cls(self) -> Any:
-        return self.solver.interpolation_cls
-
-    @property
     def scan_kind(self) -> Any:
         return self.solver.scan_kind  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -67,15 +60,6 @@ class OrthogonalProjection(diffrax.AbstractWrappedSolver, AbstractManifoldSolver
     @property
     def root_find_max_steps(self) -> Any:
         return self.solver.root_find_max_steps  # pyright: ignore[reportAttributeAccessIssue]
-
-    def order(self, terms: diffrax.AbstractTerm) -> Any:
-        return self.solver.order(terms)
-
-    def error_order(self, terms: diffrax.AbstractTerm) -> Any:
-        return self.solver.error_order(terms)
-
-    def func(self, terms: diffrax.AbstractTerm, t0: Time, y0: Any, args: Any) -> Any:
-        return self.solver.func(terms, t0, y0, args)
 
     def init(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any) -> Any:
         return unrolled(self.solver).init(terms, t0, t1, y0, args)
@@ -90,7 +74,7 @@ class OrthogonalProjection(diffrax.AbstractWrappedSolver, AbstractManifoldSolver
         solver_state: Any,
         made_jump: BoolLike,
     ) -> Any:
-        solver = unrolled(self.solver)
+        solver: Any = unrolled(self.solver)
         sign = time_sign(terms, t0, t1)
 
         def retract(t: Any, y: Any) -> Any:

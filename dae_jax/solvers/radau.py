@@ -124,7 +124,7 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
         tol = self._tolerances(y0.dtype)
         z, (newton, jacobians, factors, pivot) = _stages(lambda params: _solve(*params), (step, constant(state), tol))
         y1 = y0 + z[-1]
-        scaled = counted = _error(*constant((step, factors.real, z)), tol) * args.weights(step.h)
+        scaled = counted = _error(*constant((step, factors.real, z)), tol=tol) * args.weights(step.h)
         if args.between(self.dense).any():
             weights = args.weights(step.h, tol.raised()) * args.between(self.dense)
             between = _between(step.method, *constant((state, step.h, z))) * weights

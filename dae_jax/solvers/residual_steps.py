@@ -270,7 +270,9 @@ def at_min_step(failure: Failure, t0: Any, t1: Any, y0: Any, y1: Any, error: Any
     """(y₁, error, result) of a step. One that came to nothing has an infinite error, so that a smaller one is tried; where
     time resolves no smaller one, the error is 0, y₁ = y₀, and the result tells an adaptive solve why it ends here.
     """
-    codes, smallest = diffrax.RESULTS, is_smallest(t0, t1)
+    # pyright knows no code that is inherited.
+    codes: Any = diffrax.RESULTS
+    smallest = is_smallest(t0, t1)
     result = codes.where(failure.singular, codes.singular, codes.nonlinear_divergence)
     result = codes.where(failure.found, codes.successful, result)
     result = codes.where(failure.found & ~failure.accurate & smallest, codes.dt_min_reached, result)
