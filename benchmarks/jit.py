@@ -54,24 +54,9 @@ def _finished(compiled, starts):
 
 
 def _solve(name, finer):
-    import diffrax
-
     method, t1, rtol, atol, *_ = CASES[name]
     field = {"double pendulum": plain_diffrax._double_pendulum_field, "Robertson": _robertson}[name]
-
-    def solve(y0):
-        return diffrax.diffeqsolve(
-            diffrax.ODETerm(field),
-            getattr(diffrax, method)(),
-            t0=0.0,
-            t1=t1,
-            dt0=None,
-            y0=y0,
-            stepsize_controller=diffrax.PIDController(rtol=finer * rtol, atol=finer * atol),
-            max_steps=100_000,
-        ).ys[-1]
-
-    return solve
+    return lambda y0: plain_diffrax.end(field, t1, method, y0, finer * rtol, finer * atol)
 
 
 def _robertson(t, y, args):

@@ -80,27 +80,29 @@ def _prepare(field, start, rtol, t1, method, batch=False, atol=None):
     return np.asarray(solve()), solve
 
 
+def end(field, t1, method, y0, rtol, atol):
+    """The state at `t1`, by a call of diffrax as a user writes it."""
+    import diffrax
+
+    return diffrax.diffeqsolve(
+        diffrax.ODETerm(field),
+        getattr(diffrax, method)(),
+        t0=0.0,
+        t1=t1,
+        dt0=None,
+        y0=y0,
+        stepsize_controller=diffrax.PIDController(rtol=rtol, atol=atol),
+        max_steps=100_000,
+    ).ys[-1]
+
+
 @functools.cache
 def _compiled(field, t1, method, batch):
     """(start, tolerances) → end: compiled once for all tolerances."""
-    import diffrax
     import jax
 
     jax.config.update("jax_enable_x64", True)
-
-    def one(y0, rtol, atol):
-        sol = diffrax.diffeqsolve(
-            diffrax.ODETerm(field),
-            getattr(diffrax, method)(),
-            t0=0.0,
-            t1=t1,
-            dt0=None,
-            y0=y0,
-            stepsize_controller=diffrax.PIDController(rtol=rtol, atol=atol),
-            max_steps=100_000,
-        )
-        return sol.ys[-1]
-
+    one = functools.partial(end, field, t1, method)
     return jax.jit(jax.vmap(one, (0, None, None)) if batch else one)
 
 

@@ -16,7 +16,7 @@ from .inspection import Lowered
 from .jaxprs.checks import checks_apart
 from .jaxprs.expansions import expanded
 from .jaxprs.scalar_interpreter import Unsupported
-from .kernel_call import called
+from .kernel_call import called, without_mesh
 from .linear_map import Arrays, batched_alike, derivative_map, is_inexact
 from .settings import one_kernel_enabled
 
@@ -147,8 +147,7 @@ def _kernel(fn: Callable[..., Arrays]) -> Callable[..., Arrays]:
 
     def call(*args: PyTree) -> Arrays:
         leaves, treedef = jax.tree.flatten(args)
-        # A kernel knows of no mesh; JAX would write down for each number that it lies on none.
-        with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
+        with without_mesh():
             jaxpr = jax.make_jaxpr(lambda *xs: fn(*jax.tree.unflatten(treedef, xs)))(*leaves)
             try:
                 kernel, messages = checks_apart(expanded(jaxpr))

@@ -7,6 +7,7 @@ our own compiler where it can, else XLA's single kernels, else XLA as it is. A b
 import dataclasses
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 import jax
@@ -94,10 +95,14 @@ def as_kernel(fn: Callable[..., Any]) -> Callable[..., Any]:
 
 def _traced(fn: Callable[..., Any], shapes: PyTree) -> tuple[ClosedJaxpr, Any]:
     """The jaxpr, and the tree of the results."""
-    # A kernel knows of no mesh; JAX would write down for each number that it lies on none.
-    with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
+    with without_mesh():
         jaxpr, out = jax.make_jaxpr(fn, return_shape=True)(*shapes)
         return checks_dropped(jaxpr), jax.tree.structure(out)
+
+
+def without_mesh() -> AbstractContextManager[Any]:
+    """A kernel knows of no mesh; JAX would write down for each number that it lies on none."""
+    return jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ()))
 
 
 def called(jaxpr: ClosedJaxpr, args: Sequence[Array]) -> list[Any] | None:
