@@ -53,11 +53,6 @@ def _looped(fn: Callable[[Any], Any], items: list[Any]) -> list[Any]:
     return [jax.tree.map(lambda x, i=i: x[i], found) for i in range(len(items))]
 
 
-def _of_pairs(fn: Callable[[Any], Any], pairs: list[Any]) -> list[Any]:
-    """fn for each pair of stages: the elimination is the larger part of what there is to compile."""
-    return [fn(pairs[0])] if len(pairs) == 1 else _looped(fn, pairs)
-
-
 class Factors(NamedTuple):
     """The factors of the `real` and the `complex` iteration matrices, and what may be `round_off` of each equation."""
 
@@ -124,7 +119,10 @@ class Step(NamedTuple):
         j, m = jacobians
         real, pivot = self.linearised.factor(j, m, jnp.where(self.smallest, 1, self.method.gamma) / self.h, self.h)
         pairs = [lax.complex(pair.real / self.h, pair.imag / self.h) for pair in self.method.pairs]
-        both, others = zip(*_of_pairs(lambda c: self.linearised.factor(j, m, c, self.h), pairs), strict=True)
+        eliminated = lambda c: self.linearised.factor(j, m, c, self.h)
+        # The elimination is the larger part of what there is to compile.
+        found = map(eliminated, pairs) if len(pairs) == 1 else _looped(eliminated, pairs)
+        both, others = zip(*found, strict=True)
         round_off = tol.round_off(self.linearised, j, m, 1 / self.h, self.y0)
         return Factors(real, both, round_off), functools.reduce(jnp.minimum, others, pivot)
 
@@ -133,7 +131,7 @@ class Step(NamedTuple):
         first, *others = _combined(self.method.back, residuals)
         w = self.linearised.solve(factors.real, jnp.where(self.smallest, residuals[-1], first))
         pairs = zip(factors.complex, map(lax.complex, others[::2], others[1::2]), strict=True)
-        found = _of_pairs(lambda pair: self.linearised.solve(*pair), list(pairs))
+        found = [self.linearised.solve(*pair) for pair in pairs]
         stages = _combined(self.method.transform, [w, *(part for v in found for part in (jnp.real(v), jnp.imag(v)))])
         return -jnp.stack([jnp.where(self.smallest, w, stage) for stage in stages])
 
