@@ -70,14 +70,18 @@ def _chosen(code: Instructions, mask: Value, new: list[str], old: list[str], kin
 
 
 def kept_apart(memory: Memory, new: list[Operand], carry: list[Operand], avals: list[Aval]) -> list[Any]:
-    """What a turn gives, copied where it lies in a buffer of the loop's that gets something else."""
+    """What a turn gives: few entries as they are now, large arrays copied where they lie in a buffer of the loop's that gets
+    something else.
+    """
     new = list(map(memory.materialised, new))
     held = {x.buffer for x in carry if isinstance(x, View)}
 
     def overwritten(x: Operand, own: View) -> bool:
         return isinstance(x, View) and x.buffer in held and not (x.buffer is own.buffer and x.whole)
 
-    return [
-        memory.copied(x, aval.dtype) if isinstance(own, View) and overwritten(x, own) else x
-        for x, own, aval in zip(new, carry, avals, strict=True)
-    ]
+    def kept(x: Operand, own: Operand, aval: Aval) -> Any:
+        if not isinstance(own, View):
+            return memory.entries(x)
+        return memory.copied(x, aval.dtype) if overwritten(x, own) else x
+
+    return [kept(*each) for each in zip(new, carry, avals, strict=True)]
