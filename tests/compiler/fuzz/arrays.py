@@ -1,6 +1,7 @@
 """Recipes of what moves, gathers, writes to and adds up the entries of arrays."""
 
 import functools
+import math
 from typing import Any
 
 import jax
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from .numbers import ALL, BOOL, COMPLEX, FLOATS, INTEGERS, REAL, Draw, Operand
+from .numbers import ALL, BOOL, COMPLEX, FLOATS, INTEGERS, LARGE, REAL, Draw, Operand
 from .operations import Operation, recipe
 
 
@@ -103,8 +104,10 @@ def parted(name: str, dtype: str, draw: Draw) -> Operation:
 @recipe("reduce_max reduce_min", REAL)
 @recipe("reduce_and reduce_or reduce_xor", (*INTEGERS, *BOOL))
 def reduction(name: str, dtype: str, draw: Draw) -> Operation:
-    domain = {"reduce_sum": "grid", "reduce_prod": "units"}.get(name, "edges")
-    x = Operand(dtype, draw.shape(1), "plain" if dtype in COMPLEX and name == "reduce_sum" else domain)
+    shape = draw.shape(1)
+    many = "grid" if dtype in FLOATS and math.prod(shape) > LARGE else "edges"
+    domain = {"reduce_sum": "grid", "reduce_prod": "units"}.get(name, many)
+    x = Operand(dtype, shape, "plain" if dtype in COMPLEX and name == "reduce_sum" else domain)
     axes = draw.axes(len(x.shape))
     bind = getattr(lax, f"{name}_p").bind
     more = {"out_sharding": None} if name in ("reduce_sum", "reduce_max", "reduce_min") else {}
