@@ -46,8 +46,10 @@ def sweep(angles, rtol, t1=10.0, method="OrthogonalProjection(DOP853)", threads=
 
     from dae_jax.scenes import double_pendulum
 
+    # It turns float64 on: the starts come after it.
+    end = _compiled(double_pendulum, t1, method)
     starts = jnp.asarray(problems.double_pendulum_starts(angles))
-    ends = jax.jit(jax.vmap(_compiled(double_pendulum, t1, method), (0, None)))
+    ends = jax.jit(jax.vmap(end, (0, None)))
     solve = lambda: ends(starts, rtol).block_until_ready()
     # A batch takes the processors that the process may use when it is compiled.
     processors = os.sched_getaffinity(0)
