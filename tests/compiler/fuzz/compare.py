@@ -7,6 +7,7 @@
 | sums and products of many floats | in pairs, in a loop, in XLA's order | numbers where each order gives the same |
 | the least and the largest of many floats | XLA loses a NaN (`reduce_min` of 4,097 in float32) | numbers |
 | `clz` of a known negative number | XLA has −56, where it has 0 of one that is not known | numbers that are not known |
+| a / b of a known b | XLA multiplies by 1/b | to 1 unit |
 | a·b + c | rounded once or twice | numbers where that is the same |
 | complex products, quotients | Smith's quotient here | finite ones, divisors not 0, to 16 units |
 | `select_n` of a number out of range | the nearest case here | nothing |

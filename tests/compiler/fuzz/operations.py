@@ -126,7 +126,9 @@ def of_pair(name: str, dtype: str, draw: Draw) -> Operation:
     )
     fn = ad_util.add_any_p.bind if name == "add_any" else getattr(lax, name)
     smooth = dtype in FLOATS and name in ("add", "sub", "mul", "div", "rem")
-    return _with_number(Operation(name, fn, (x, x), 16 if of_complex else 0, smooth), draw)
+    # XLA multiplies by the reciprocal of a known divisor.
+    ulps = 16 if of_complex else int(name == "div" and dtype in FLOATS)
+    return _with_number(Operation(name, fn, (x, x), ulps, smooth), draw)
 
 
 @recipe("and or xor", (*INTEGERS, *BOOL))
