@@ -33,7 +33,7 @@ from .formulations import (
     Residual as Residual,
     StateSpace as StateSpace,
 )
-from .solution import RESULTS as RESULTS, DAESolution as DAESolution
+from .solution import RESULTS as RESULTS, AccuracyWarning as AccuracyWarning, DAESolution as DAESolution
 from .solve import daesolve as daesolve
 from .solvers import (
     BDF as BDF,

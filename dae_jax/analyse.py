@@ -16,6 +16,7 @@ from .equations.taylor import total_derivatives
 from .structure import Block, block_triangular, pantelides
 from .systems import System, is_mechanism
 from .types import Args, Flat, State, Time
+from .validate.captured import current
 from .validate.states import counted, refuse_wrong_state
 from .validate.user_functions import refuse_wrong_functions
 
@@ -180,6 +181,7 @@ def analyse(system: System, t0: Time, y0: State, args: Args = None) -> Structure
     variables that have too few equations.
     """
     refuse_wrong_state(system, y0)
+    system = current(system)
     y0 = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
     refuse_wrong_functions(system, t0, y0, args)
     form = ResidualForm.of(system, t0, y0, args)

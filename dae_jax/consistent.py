@@ -19,6 +19,7 @@ from .equations.structural_ode import StructuralODE
 from .linalg import fixed_point, implicit_root, relative_change
 from .systems import ConstrainedSystem, System, is_mechanism
 from .types import Args, Phase, Scalar, State, Time
+from .validate.captured import current
 from .validate.states import broadcast_to_state, refuse_wrong_state, with_rates
 from .validate.user_functions import refuse_wrong_functions
 
@@ -134,13 +135,14 @@ def look_at_start(
 class End(eqx.Module):
     """What a mechanism's state at the end of a solve says: whether it satisfies the constraints (see `is_near_constraints`)
     and these nearly depend on each other; whether the masses are regular there, and also beyond, where a solve that failed
-    did not get.
+    did not get. `drifted`: whether it is off the constraints by more than the tolerances.
     """
 
     near: Bool[Array, ""]
     singular: Bool[Array, ""]
     masses: Bool[Array, ""]
     masses_ahead: Bool[Array, ""]
+    drifted: Bool[Array, ""]
 
 
 def look_at_end(
@@ -158,17 +160,17 @@ def look_at_end(
     """The state (t, y) at the `end` of a solve."""
     yes = jnp.asarray(True)
     if not is_mechanism(system):
-        return End(yes, ~yes, yes, yes)
+        return End(yes, ~yes, yes, yes, ~yes)
     ode = MechanicalODE.of(system, t0, start, args, rank)
     start, (t, end) = ode.encode(start), (end[0], ode.encode(end[1]))
-    near = is_near_constraints(ode, t, start, end, keeps, tolerances, residual)
+    near, drifted = is_near_constraints(ode, t, start, end, keeps, tolerances, residual)
     singular = ~yes if ode.rank else weakest(ode, t, end) < jnp.finfo(t.dtype).eps ** SINGULAR
     if not callable(system.mass):
-        return End(near, singular, yes, yes)
+        return End(near, singular, yes, yes, drifted)
     (q, v), finite = end, jnp.all(jnp.isfinite(end[0]))
     regular = lambda q: mass_is_regular(ode, q, invertible) | ~finite
     ahead = [regular(q + AHEAD**k * (t - t0) * v) for k in (1, 2, 3)]
-    return End(near, singular, regular(q), ahead[0] & ahead[1] & ahead[2])
+    return End(near, singular, regular(q), ahead[0] & ahead[1] & ahead[2], drifted)
 
 
 def consistent_state(
@@ -199,7 +201,7 @@ def consistent_state(
     arguments are traced.
     """
     refuse_wrong_state(system, y0)
-    system = with_rates(system, yd0, y0)
+    system = current(with_rates(system, yd0, y0))
     y0 = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
     refuse_wrong_functions(system, t0, y0, args)
     masks = jax.tree.map(lambda x: jnp.zeros_like(x, dtype=bool), y0)

@@ -19,6 +19,7 @@ from .equations.residual_drift import EquationDrift, equation_drift
 from .solution import DAESolution, without_padding
 from .systems import ConstrainedSystem, ImplicitDAE, SemiExplicitDAE, System, is_mechanism
 from .types import Args, State, Time
+from .validate.captured import current
 from .validate.states import brief, refuse_wrong_state, refuse_wrong_system
 from .validate.user_functions import refuse_no_real_number, refuse_wrong_functions, returned
 
@@ -53,6 +54,7 @@ def drift(system: System, sol: DAESolution) -> Drift | EquationDrift:
     Errors: `ValueError` for a solution without saved states.
     """
     refuse_wrong_system(system)
+    system = current(system)
     if not is_mechanism(system):
         return EquationDrift(_at_saved_times(system, sol, lambda t, y, args: equation_drift(system, t, y, args)))
 
@@ -71,6 +73,7 @@ def energy(system: ConstrainedSystem, sol: DAESolution) -> Float[Array, " times"
     """
     if getattr(system, "potential", None) is None:
         raise ValueError("The energy needs `ConstrainedSystem(..., potential=lambda q, args: ...)`.")
+    system = current(system)
     potential: Any = system.potential
 
     def total(t: Time, y: State, args: Args) -> Any:
@@ -106,6 +109,7 @@ def multipliers(system: ConstrainedSystem, *at: Any) -> Any:
     point that is concrete has none.
     """
     refuse_wrong_system(system)
+    system = current(system)
     if not is_mechanism(system):
         raise ValueError(
             f"`multipliers` takes a ConstrainedSystem; those of this {type(system).__name__} are among its unknowns, in `sol.ys`."

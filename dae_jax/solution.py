@@ -14,6 +14,10 @@ from ._compat import messages
 from .types import DType, State, Time
 
 
+class AccuracyWarning(UserWarning):
+    """A solve that went well, with an answer that may be off by more than was asked for."""
+
+
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     """diffrax's result codes, and those of a DAE."""
 
@@ -116,7 +120,8 @@ class DAESolution(eqx.Module):
     - `interpolation`: with `SaveAt(dense=True)`, the solution at any time; `sol.evaluate(t)` for short.
     - `stats`: counts of steps; `stats["end_time"]`: the time at which the solve ended; of a solve outside `jit`, `vmap` and
       `grad` also "compile_seconds", the time that it took to trace and compile it and to run it for the first time, 0 where it
-      was compiled already.
+      was compiled already; `stats["doubts"]`: 0, or what an `AccuracyWarning` says, as the sum of 1 (drifted), 2 (fixed steps too
+      large) and 4 (very many steps).
     - `result`: a `RESULTS` code, with its message.
     - `event_mask`: which event ended the solve, if any.
     - `rank`: how many constraints are independent, where some are redundant, else `None`.

@@ -10,6 +10,7 @@ import numpy as np
 from jax.core import Tracer
 
 from .compiler.types import Arrays
+from .driver.doubts import warn
 from .driver.failures import OKAY, in_words, raised_in_the_program
 from .driver.options import refuse_misfits, refuse_no_event, refuse_other_steps, refuse_wrong_options
 from .driver.problem import Problem, Program, split
@@ -29,6 +30,7 @@ from .solution import DAESolution
 from .solvers import AbstractResidualSolver, SelectedResiduals, SelectedStates, takes_residuals
 from .systems import System, is_mechanism
 from .types import Args, Controller, DType, ProgressMeter, Solver, State, Time
+from .validate.captured import current
 from .validate.states import with_rates
 from .validate.user_functions import not_finite, refuse_wrong_functions
 
@@ -79,7 +81,9 @@ def daesolve(
     **Returns** a `DAESolution`.
 
     Errors: `ValueError` or `TypeError` in a sentence for wrong input that is concrete; `RuntimeError` where the solve
-    fails, or a `RESULTS` code with `throw=False`.
+    fails, or a `RESULTS` code with `throw=False`. An `AccuracyWarning` where it does not fail, but the answer is doubtful: it has
+    drifted off the constraints by more than a thousand tolerances, fixed steps are too large for the motion, or a million steps
+    may add up their errors; in a batch or under `jit` `stats["doubts"]` says so, by bits 1, 2 and 4.
     """
     solve, problem = prepared(
         with_rates(system, yd0, y0), solver, t0, t1, dt0, y0, args, formulation, saveat, stepsize_controller, adjoint, event,
@@ -90,7 +94,10 @@ def daesolve(
         sol, *_ = run(program, arrays)
     else:
         sol = _run_on_numbers(program, arrays, solve, problem)
-    return _raise_if_failed(sol, problem) if throw else sol
+    sol = _raise_if_failed(sol, problem) if throw else sol
+    if not isinstance(sol.stats["doubts"], Tracer):
+        warn(sol, stacklevel=2)
+    return sol
 
 
 def prepared(
@@ -111,11 +118,12 @@ def prepared(
 ) -> tuple[Solve, Problem]:
     """The method and the problem of a solve, checked, with the defaults filled in."""
     y0, args = checked(system, t0, t1, dt0, y0, args)
+    system, args, formulation, saveat, event = current((system, args, formulation, saveat, event))
     refuse_wrong_options(saveat, stepsize_controller, adjoint, event, max_steps, progress_meter)
     if formulation is None and takes_residuals(solver):
         formulation = _for_residuals(system, t0, y0, args, solver)
     elif formulation is None:
-        formulation = Differentiation()
+        formulation = _UNDERLYING_ODE
     refuse_misfits(formulation, solver)
     refuse_other_steps(solver, stepsize_controller, dt0)
     if isinstance(formulation, Residual) and formulation.variable_index is None and takes_residuals(solver):
@@ -139,7 +147,7 @@ def prepared(
         refuse_no_event(solver)
     if isinstance(event, Reset):
         refuse_other_outputs(saveat)
-    solve = Solve(formulation, solver, saveat, stepsize_controller, adjoint, event, max_steps, progress_meter)
+    solve = Solve(formulation, solver, saveat, stepsize_controller, adjoint, event, progress_meter, max_steps)
     return solve, Problem(system, start, end, step, y0, args, getattr(system, "rank", None))
 
 
@@ -210,6 +218,7 @@ def _default_controller(dt0: Time | None, dtype: DType) -> diffrax.AbstractStepS
     return _PID64 if dtype == jnp.float64 else _PID32
 
 
+_UNDERLYING_ODE = Differentiation()
 _PID64, _PID32 = (diffrax.PIDController(rtol=tolerance, atol=tolerance) for tolerance in (1e-8, 1e-5))
 
 

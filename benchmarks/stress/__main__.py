@@ -81,7 +81,7 @@ def _line(cell):
     lost = f" by {cell.lost:.1f} digits" if cell.verdict == "degraded" else ""
     said = (
         cell.words
-        if cell.ended != "answer"
+        if cell.ended != "answer" or cell.verdict == "warned"
         else f"error {cell.error:.1e} of {cell.allowed:.0e} allowed, drift {cell.drift:.0e}"
     )
     return f"{cell.family:10s} {cell.stressor:28s} {cell.method:20s} {cell.verdict}{lost}: {said[:110]}"

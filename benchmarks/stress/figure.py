@@ -34,7 +34,7 @@ def table(cells):
         colour = GOOD if cell.lost == 0 else colours(norm(cell.lost))
         colour = WRONG if cell.verdict == "WRONG" else SILENT if undue else colour
         axes.add_patch(_square(x, y, colour))
-        marker = "x" if cell.verdict == "WRONG" else {"refused": "s", "failed": "^"}.get(cell.ended)
+        marker = {"WRONG": "x", "warned": "D"}.get(cell.verdict, {"refused": "s", "failed": "^"}.get(cell.ended))
         if marker:
             ink = "white" if cell.verdict == "WRONG" or not undue else "#3A3F45"
             axes.plot(
@@ -65,6 +65,9 @@ def table(cells):
         Patch(color=GOOD, label="all digits that were asked for"),
         Line2D([], [], marker="s", color="#3A3F45", markerfacecolor="none", label="refused in words", **ink),
         Line2D([], [], marker="^", color="#3A3F45", markerfacecolor="none", label="failed in words", **ink),
+        Line2D(
+            [], [], marker="D", color="#3A3F45", markerfacecolor="none", label="no two digits, and a warning", **ink
+        ),
         Patch(color=SILENT, label="no answer, where there is one"),
         Line2D([], [], marker="x", color=WRONG, label="WRONG: no two digits, no word", **ink),
     ]

@@ -17,7 +17,7 @@ BOTH = ("refused", "failed")
 
 @dataclasses.dataclass(frozen=True)
 class Cell:
-    """A cell of the table; `verdict` is "ok", "degraded", "refused", "failed" or "WRONG", `lost` the digits lost beyond what is
+    """A cell of the table; `verdict` is "ok", "degraded", "warned", "refused", "failed" or "WRONG", `lost` the digits lost beyond what is
     allowed, `due` whether the words that a solve ended in are what must happen.
     """
 
@@ -42,8 +42,10 @@ def judged(family: str, case: Case, method: str, outcome: Outcome) -> Cell:
     lost = float(max(np.log10(outcome.error / allowed), 0.0)) if outcome.error > 0 else 0.0
     if outcome.ended == "answer":
         least = 1.0 if case.lasting else max(WRONG, 10 * allowed)
-        bad = case.due in ("failure", "refusal", "words") or not outcome.error <= least
-        verdict = "WRONG" if bad else "degraded" if lost > 0 else "ok"
+        due = case.due in ("failure", "refusal") or (case.due == "words" and not outcome.words)
+        bad = case.due == "words" or not outcome.error <= least
+        silent = due or (bad and not outcome.words)
+        verdict = "WRONG" if silent else "warned" if bad else "degraded" if lost > 0 else "ok"
     else:
         late = case.due == "failure" and outcome.end > case.ends + AT_THE_TIME * case.t1
         early = case.due == "failure" and outcome.end < case.ends - AT_THE_TIME * case.t1

@@ -12,7 +12,7 @@ from .record import TABLE
 
 PAGE, MAP = "stress.md", "stress.png"
 NAMES = (TABLE, PAGE, MAP)
-VERDICTS = ("ok", "degraded", "refused", "failed", "WRONG")
+VERDICTS = ("ok", "degraded", "warned", "refused", "failed", "WRONG")
 HEAD = """# What each method can take
 
 Written by `dae-jax stress`: {count} solves in {minutes:.0f} minutes; nothing here is typed by hand. The command prints each cell, and
@@ -25,6 +25,7 @@ scipy at 1e-13. Errors are relative to the size of the motion, and drift is |g| 
   times (ωh)^p a radian of motion. Or words, where words are what must come: a state that does not exist is refused, a
   mechanism beyond its reach fails at its time.
 - **degraded** by so many digits below that, with at least two digits left.
+- **warned**: fewer than two digits, and an `AccuracyWarning` that says why.
 - **refused** before the solve or **failed** in it, with a sentence that says why, though there is an answer.
 - **WRONG**: fewer than two digits, and no word.
 
@@ -130,7 +131,7 @@ def _family(family, cells):
 def _entry(cell, words):
     if cell is None:
         return ""
-    if cell.ended == "answer":
+    if cell.ended == "answer" and cell.verdict != "warned":
         lost = f" −{cell.lost:.1f}" if cell.verdict == "degraded" else ""
         return f"{cell.verdict}{lost} {cell.error:.0e}"
     said = re.sub(r" The solve from t = .*", "", cell.words)

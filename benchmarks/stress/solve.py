@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import time
+import warnings
 
 import diffrax
 import jax
@@ -17,7 +18,9 @@ from .cases import METHODS, Case
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """How a solve ended: "answer", "refused" or "failed"; the rest where it is known. `series`: growth over time."""
+    """How a solve ended: "answer", "refused" or "failed"; the rest where it is known. `words`: why, or what it warned of; `series`:
+    growth over time.
+    """
 
     ended: str
     words: str = ""
@@ -40,12 +43,15 @@ def solved(case: Case, name: str) -> Outcome:
     tolerances = {"rtol": np.asarray(case.rtol), "atol": np.asarray(case.rtol * smallest)}
     tolerances = {name: value.astype(case.y0[0].dtype) for name, value in tolerances.items()}
     times = np.linspace(0.0, case.t1, case.times)
+    said: list[warnings.WarningMessage] = []
     try:
-        sol = dj.daesolve(
-            case.system, method.solver, 0.0, case.t1, case.t1 / case.steps if fixed else None, case.y0, case.args,
-            formulation=formulation, stepsize_controller=None if fixed else diffrax.PIDController(**tolerances),
-            saveat=diffrax.SaveAt(ts=times), max_steps=case.max_steps, throw=False,
-        )  # fmt: skip
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always", dj.AccuracyWarning)
+            sol = dj.daesolve(
+                case.system, method.solver, 0.0, case.t1, case.t1 / case.steps if fixed else None, case.y0, case.args,
+                formulation=formulation, stepsize_controller=None if fixed else diffrax.PIDController(**tolerances),
+                saveat=diffrax.SaveAt(ts=times), max_steps=case.max_steps, throw=False,
+            )  # fmt: skip
         code, steps, end = (
             np.asarray(x).item() for x in (sol.result._value, sol.stats["num_steps"], sol.stats["end_time"])
         )
@@ -65,7 +71,8 @@ def solved(case: Case, name: str) -> Outcome:
     series = {}
     if case.energy is not None:
         series = {"t": times, "error": errors, "drift": drifts, "energy": case.energy(q, v)}
-    return Outcome("answer", error=float(errors.max()), drift=float(drifts.max()), series=series, **taken)
+    words = " ".join(str(each.message) for each in said if issubclass(each.category, dj.AccuracyWarning))
+    return Outcome("answer", words, error=float(errors.max()), drift=float(drifts.max()), series=series, **taken)
 
 
 @functools.cache

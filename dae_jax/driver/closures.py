@@ -21,6 +21,8 @@ from jax.core import Tracer
 from jax.tree_util import Partial
 from jaxtyping import PyTree
 
+from ..validate.captured import Same, values_of
+
 
 def opened(leaf: Any, within: tuple[Any, ...] = ()) -> Any:
     """`leaf`, if it is a function that closes over traced numbers, as a pytree that has them as leaves and computes the same.
@@ -36,7 +38,7 @@ def opened(leaf: Any, within: tuple[Any, ...] = ()) -> Any:
         try:
             return jax.tree.map(lambda x: opened(x, within), tree)
         except (TypeError, ValueError):  # a dictionary whose keys have no order
-            return _Same(tree)
+            return Same(tree)
 
     if isinstance(leaf, functools.partial):
         bound = look((leaf.func, leaf.args, leaf.keywords))
@@ -55,7 +57,7 @@ def opened(leaf: Any, within: tuple[Any, ...] = ()) -> Any:
     traced = list(map(_is_traced, values))
     if not any(traced):
         return leaf
-    rest = tuple(None if t else _Same(x) for x, t in zip(captured, traced, strict=True))
+    rest = tuple(None if t else Same(x) for x, t in zip(captured, traced, strict=True))
     return _Closure([x for x, t in zip(values, traced, strict=True) if t], _Body(leaf, rest))
 
 
@@ -63,24 +65,12 @@ def _is_traced(tree: PyTree) -> bool:
     return any(isinstance(x, Tracer) for x in jax.tree.leaves(tree))
 
 
-class _Same:
-    """An object that is equal to itself alone."""
-
-    def __init__(self, value: object) -> None:
-        self.value = value
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and self.value is other.value
-
-    def __hash__(self) -> int:
-        return id(self.value)
-
-
 class _Body:
     """A function but for what it has captured; the same for a `lambda` that is made anew."""
 
-    def __init__(self, fn: types.FunctionType, rest: tuple[_Same | None, ...]) -> None:
+    def __init__(self, fn: types.FunctionType, rest: tuple[Same | None, ...]) -> None:
         self.code, self.globals, self.name, self.rest = fn.__code__, fn.__globals__, fn.__qualname__, rest
+        self.values = values_of(fn, tuple(None if x is None else x.value for x in rest))
         self.defaults, self.keywords = len(fn.__defaults__ or ()), tuple(fn.__kwdefaults__ or {})
 
     def __eq__(self, other: object) -> bool:
@@ -89,6 +79,7 @@ class _Body:
             and self.code is other.code
             and self.globals is other.globals
             and (self.rest, self.defaults, self.keywords) == (other.rest, other.defaults, other.keywords)
+            and self.values == other.values
         )
 
     def __hash__(self) -> int:

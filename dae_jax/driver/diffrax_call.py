@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix
+from jax import lax
 
 from ..equations.manifold_ode import Equations, ManifoldODE
 from ..formulations import AbstractFormulation
@@ -26,6 +27,7 @@ from ..types import Args, BoolLike, Time, Y
 from .problem import Problem
 from .start import is_saved_part
 from .trajectory_adjoint import as_it_is, can_be_taped
+from .watched_steps import WatchedSteps
 
 
 if TYPE_CHECKING:
@@ -84,6 +86,9 @@ def call(solve: "Solve", problem: Problem) -> tuple[Any, ...]:
         ),
     )
     saveat = dataclasses.replace(saveat, solver_state=True) if counts(solver) else saveat
+    watched = isinstance(controller, diffrax.ConstantStepSize) and not solve.recording
+    if watched:
+        controller, saveat = WatchedSteps(controller), dataclasses.replace(saveat, controller_state=True)
     sol = diffrax.diffeqsolve(
         solve.formulation.term(),
         _for_derivative(solve, solver, y),
@@ -101,7 +106,8 @@ def call(solve: "Solve", problem: Problem) -> tuple[Any, ...]:
     starts = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(y)]))
     result = RESULTS.where(starts, RESULTS.promote(sol.result), RESULTS.no_finite_start)
     stats.update((name, getattr(sol.solver_state, name)) for name in counts(solver))
-    return sol.t0, sol.t1, ts["user"], ys["user"], interpolation, stats, result, sol.event_mask, end
+    errors = lax.stop_gradient(cast(Any, sol.controller_state)[-1]) if watched else None
+    return sol.t0, sol.t1, ts["user"], ys["user"], interpolation, stats, result, sol.event_mask, errors, end
 
 
 def _for_derivative(solve: "Solve", solver: diffrax.AbstractSolver, y: Y) -> Any:

@@ -10,6 +10,7 @@ from jaxtyping import Array, PyTree
 
 from ..solution import RESULTS, DAESolution, all_finite, precision_of
 from ..solvers import takes_residuals
+from . import doubts
 from .problem import Problem, count_of
 from .start import is_saved_part, saved_parts
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 def judged(solve: "Solve", out: Sequence[PyTree], problem: Problem, found: tuple[PyTree, ...]) -> DAESolution:
     """The solution, with the code of what is wrong with it; `found`: what a look at its start and its end has shown."""
-    t0, t1, ts, ys, interpolation, stats, code, event_mask = out
+    t0, t1, ts, ys, interpolation, stats, code, event_mask, errors = out
     (start, _), end, (finite_end, defined) = found
     failed = lambda name, instead, when=True: RESULTS.where((code == name) & when, instead, code)
     if takes_residuals(solve.solver):
@@ -50,6 +51,11 @@ def judged(solve: "Solve", out: Sequence[PyTree], problem: Problem, found: tuple
     ):
         code = RESULTS.where(start == wrong, getattr(RESULTS, name), code)
     rank = count_of(problem.rank)
+    went_well = (code == RESULTS.successful) | (code == RESULTS.event_occurred)
+    stats = {
+        **stats,
+        "doubts": jnp.where(went_well, doubts.found(solve, end.drifted, stats["num_accepted_steps"], errors), 0),
+    }
     return DAESolution(t0, t1, ts, ys, interpolation, stats, code, event_mask, problem.args, rank, precision)
 
 

@@ -75,11 +75,13 @@ def split(tree: PyTree) -> tuple[Program, list[Any]]:
     return Program(treedef, static, tuple(map(type, static)), one_kernel_enabled()), arrays
 
 
-class Split(eqx.Module):
+@functools.partial(jax.tree_util.register_dataclass, data_fields=("numbers",), meta_fields=("rest",))
+@dataclasses.dataclass(frozen=True)
+class Split:
     """What a jitted function returns: its arrays, and the rest."""
 
     numbers: Any
-    rest: Any = eqx.field(static=True)
+    rest: Any
 
     @classmethod
     def of(cls, tree: PyTree) -> "Split":

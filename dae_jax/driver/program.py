@@ -20,6 +20,7 @@ from ..formulations import AbstractFormulation
 from ..solution import DAESolution
 from ..solvers import AbstractManifoldSolver, economical, replays, takes_residuals
 from ..types import Scalar, State
+from ..validate.captured import settle
 from ..validate.user_functions import refuse_wrong_functions, returned
 from .diffrax_call import Decode, View, call
 from .outcome import judged
@@ -48,6 +49,7 @@ def _jitted(program: Program, arrays: Arrays) -> Any:
     waiting.begin(always=not isinstance(solve.progress_meter, diffrax.NoProgressMeter))
     solve.refuse_wrong_functions(problem)
     sol, as_expected = solve_with_resets(solve, problem) if isinstance(solve.event, Reset) else solve(problem)
+    settle(program.leaves)
     return Split.of(sol), as_expected
 
 
@@ -55,7 +57,9 @@ def _jitted(program: Program, arrays: Arrays) -> Any:
 def _numbers(program: Program, arrays: Arrays) -> Split:
     """diffrax's part of a solve; jitted, so that derivatives and batches of it find it traced."""
     solve, problem = program.whole(arrays)
-    return Split.of(call(solve, problem))
+    found = Split.of(call(solve, problem))
+    settle(program.leaves)
+    return found
 
 
 def run(program: Program, arrays: Arrays) -> tuple[DAESolution, Any, float]:
@@ -77,7 +81,13 @@ def run(program: Program, arrays: Arrays) -> tuple[DAESolution, Any, float]:
     return sol.whole(), as_expected, seconds
 
 
-class Solve(eqx.Module):
+@functools.partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("formulation", "solver", "saveat", "controller", "adjoint", "event", "progress_meter"),
+    meta_fields=("max_steps", "recording"),
+)
+@dataclasses.dataclass(frozen=True, eq=False)
+class Solve:
     """All that is fixed about a solve, as one callable for `jit`."""
 
     formulation: AbstractFormulation
@@ -86,10 +96,10 @@ class Solve(eqx.Module):
     controller: diffrax.AbstractStepSizeController
     adjoint: diffrax.AbstractAdjoint
     event: diffrax.Event | Reset | None
-    max_steps: int | None = eqx.field(static=True)
     progress_meter: diffrax.AbstractProgressMeter
+    max_steps: int | None
     # Whether the dense output is there for the tape alone.
-    recording: bool = eqx.field(static=True, default=False)
+    recording: bool = False
 
     def __call__(self, problem: Problem) -> tuple[DAESolution, Any]:
         backwards = problem.t1 < problem.t0
@@ -182,6 +192,7 @@ class Solve(eqx.Module):
             fixed_steps = isinstance(self.controller, diffrax.ConstantStepSize)
             tape = ts["tape"], ys["tape"], None if interpolation is None else interpolation.path.infos
             of_taped = cotangents(eqx.combine(found, Taped(*fixed)), fixed_steps, tape, of_ys)
+            settle(program.leaves)
             return inexact(through_encoding(saved_times(of_taped, self.saveat.subs, of_t0, of_t1, of_ts))[0])
 
         return pull_back

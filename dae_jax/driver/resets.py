@@ -198,6 +198,7 @@ def solve_with_resets(solve: "Solve", problem: Problem) -> tuple[DAESolution, An
         ts = jnp.where(here, wanted, p.ts)
         ys = jax.tree.map(lambda a, b: jnp.where(here.reshape(-1, *(1,) * (a.ndim - 1)), a, b), sol.ys["wanted"], p.ys)
         stats = {k: p.stats[k] + v for k, v in sol.stats.items() if k not in NO_COUNTS}
+        stats["doubts"] = p.stats["doubts"] | sol.stats["doubts"]
         code = sol.result._value
         # Jumps so close that their order is round-off are no events any more.
         piled = (p.count > 0) & (sign * (end - p.t) <= 16 * resolution * (1 + jnp.abs(end)))

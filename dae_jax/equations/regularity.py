@@ -16,8 +16,10 @@ from .mechanical import MechanicalODE, allowed_contradiction
 
 # A drift that counts as large as the solution itself, as a part of this: the distance to |q| = 1 is nowhere more than |q|/2.
 LARGE = 0.25
-# What a step may leave of the constraints that its method keeps, in parts of the tolerance.
+# What a step may leave of the constraints that its method keeps, in parts of the tolerance, and what is left where the answer is
+# not to be trusted.
 LEFT = 100
+DRIFTED = 1000
 # Tolerances that stand in for those of fixed steps.
 COARSE = 1e-3
 
@@ -207,8 +209,8 @@ def is_near_constraints(
     keeps: tuple[bool, bool],
     tolerances: tuple[Time, Time],
     residual: bool,
-) -> Bool[Array, ""]:
-    """Whether a flat state at the end of a solve satisfies g and (ġ, h).
+) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+    """Whether a flat state at the end of a solve satisfies g and (ġ, h), and whether it has drifted by more than the tolerances.
 
     A level that the method `keeps` must hold to round-off, or to the tolerances (relative, absolute) where it solves for a
     `residual`. One that it lets drift may be off by a part of the solution's size; of constraints that depend on each
@@ -222,12 +224,14 @@ def is_near_constraints(
     field = jnp.zeros_like(lengths) if keeps[1] else size(ode.field(t, end)[1])
     natural = jnp.sqrt(jnp.where(jnp.isfinite(field), field, 0) * lengths)
     speeds = jnp.maximum(jnp.maximum(size(start[1]), size(end[1])), natural)
-    near = jnp.asarray(True)
+    near, drifted = jnp.asarray(True), jnp.asarray(False)
     for distance, kept, here in zip(ode.distances(t, end), keeps, (lengths, speeds), strict=True):
         by_tolerance = LEFT * (atol + rtol * here) if residual or not kept else 0
         allowed = root * (1 + here) + by_tolerance + (0 if kept else LARGE * here)
         near = near & jnp.all(distance <= allowed)
-    return near & _redundant_agree(ode, t, end, root)
+        if not kept:
+            drifted = drifted | jnp.any(distance > root * (1 + here) + DRIFTED * (atol + rtol * here))
+    return near & _redundant_agree(ode, t, end, root), drifted & (rtol + atol > 0)
 
 
 def _redundant_agree(ode: MechanicalODE, t: Time, y: Phase, root: float | np.floating) -> Bool[Array, ""]:

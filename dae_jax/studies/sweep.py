@@ -27,6 +27,7 @@ from ..compiler.jaxprs.walk import equations, jaxprs_in
 from ..driver.failures import sentence_of
 from ..solution import RESULTS
 from ..types import State
+from ..validate.captured import current
 from ..validate.states import brief
 from .progress import Progress
 from .sweep_store import Memory, Store
@@ -112,6 +113,7 @@ def sweep(
     """
     if not callable(fn):
         raise TypeError(f"`fn` must be a function of one element, but is {brief(fn)}.")
+    fn = current(fn)
     elements = inputs.elements() if isinstance(inputs, Grid) else jax.tree.map(np.asarray, inputs)
     size = _leading(elements)
     devices = list(devices or jax.local_devices())

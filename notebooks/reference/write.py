@@ -24,7 +24,7 @@ PAGES = {
     "solving": (
         "Solving",
         "One solve, its result, and how it ended; [errors](../errors.md) has each code with an example.",
-        "daesolve DAESolution RESULTS",
+        "daesolve DAESolution RESULTS AccuracyWarning",
     ),
     "formulations": (
         "Formulations",
@@ -156,7 +156,7 @@ def _words(name: str) -> str:
 def _entry(name: str) -> Iterator[str]:
     value = _value(name)
     yield from ("```python", signature(name), "```", "", *_markdown(_words(name)))
-    if hasattr(value, "_index_to_message"):
+    if hasattr(value, "_index_to_message") or (isinstance(value, type) and issubclass(value, Warning)):
         members = [ast.unparse(node.targets[0]) for node in _tree(value).body if isinstance(node, ast.Assign)]
         yield from ("", *(f"- `{member}`: {value[getattr(value, member)]}" for member in members))
     elif isinstance(value, type):
@@ -187,7 +187,7 @@ def signature(name: str) -> str:
     value = _value(name)
     if not callable(value):
         return f"dae_jax.{name}"
-    if hasattr(value, "_index_to_message"):
+    if hasattr(value, "_index_to_message") or (isinstance(value, type) and issubclass(value, Warning)):
         return f"dae_jax.{name}"
     returns = ""
     if inspect.isfunction(value):

@@ -33,7 +33,7 @@ def test_the_command_writes_table_page_and_map(tmp_path, capsys):
     assert "| rattle | 5 |" in said
     assert "violates the constraints" in said
     assert (tmp_path / "stress.png").stat().st_size > 10_000
-    assert "5 ok, 0 degraded, 0 refused, 0 failed, 0 WRONG" in capsys.readouterr().out
+    assert "5 ok, 0 degraded, 0 warned, 0 refused, 0 failed, 0 WRONG" in capsys.readouterr().out
     # Another method is added to what is there.
     argv[argv.index("rattle")] = "state-space"
     assert main(argv) == 0
@@ -72,6 +72,10 @@ def case(**rest):
         ("ok", Outcome("refused", "…"), {"due": "any"}),
         ("WRONG", Outcome("answer", error=0.1), {"due": "any"}),
         ("WRONG", Outcome("answer", error=0.0), {"due": "words"}),
+        ("warned", Outcome("answer", "…", error=0.1), {"due": "words"}),
+        ("warned", Outcome("answer", "…", error=0.1), {}),
+        ("degraded", Outcome("answer", "…", error=1e-3), {}),
+        ("WRONG", Outcome("answer", "…", error=0.0), {"due": "failure", "ends": 5.0}),
     ],
 )
 def test_verdicts(verdict, outcome, rest):
@@ -119,4 +123,4 @@ def test_the_page_of_the_repository_is_that_of_its_table(tmp_path):
 
 def test_counts_are_those_of_the_cells():
     cells = [judged("", case(), "rattle", Outcome("answer", error=x)) for x in (0.0, 1.0)]
-    assert page.counts(cells) == "1 ok, 0 degraded, 0 refused, 0 failed, 1 WRONG"
+    assert page.counts(cells) == "1 ok, 0 degraded, 0 warned, 0 refused, 0 failed, 1 WRONG"

@@ -65,7 +65,7 @@ def test_equals_diffrax_with_respect_to_everything(solver, saveat, steps):
 def test_is_used_where_it_should_be():
     solve = dae_jax.driver.program.Solve(
         dae_jax.Differentiation(), dae_jax.DOP853(), diffrax.SaveAt(t1=True), diffrax.PIDController(1e-6, 1e-6),
-        diffrax.RecursiveCheckpointAdjoint(), None, 1000, diffrax.NoProgressMeter(),
+        diffrax.RecursiveCheckpointAdjoint(), None, diffrax.NoProgressMeter(), 1000,
     )  # fmt: skip
     assert can_be_taped(solve, 4)
     assert not can_be_taped(solve, LARGEST_TAPE // 1000)

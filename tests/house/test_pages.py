@@ -101,7 +101,11 @@ class TestErrors:
             assert names["result"] == getattr(dae_jax.RESULTS, name), (name, names["result"])
 
     def test_exceptions_are_raised(self, names):
-        for program in programs(ERRORS.split("## Exceptions")[1]):
+        for program in programs(ERRORS.split("## Exceptions")[1].split("## Warnings")[0]):
+            exec(program, names)
+
+    def test_warnings_are_given(self, names):
+        for program in programs(ERRORS.split("## Warnings")[1]):
             exec(program, names)
 
 

@@ -4,6 +4,7 @@
 Arrays come from numpy and from arguments: strict mode takes no function of `jax.numpy`, whose types it knows in part only.
 """
 
+import warnings
 from typing import Any
 
 import diffrax
@@ -73,6 +74,8 @@ def solved() -> dae_jax.DAESolution:
     )
     if sol.result != dae_jax.RESULTS.successful:
         raise RuntimeError(str(sol.result))
+    if sol.stats["doubts"]:
+        warnings.warn("doubtful", dae_jax.AccuracyWarning, stacklevel=2)
     return sol
 
 

@@ -1,0 +1,64 @@
+"""What makes an answer doubtful though no step has failed: bits of `stats["doubts"]`, and a warning in words."""
+
+import enum
+import warnings
+from typing import TYPE_CHECKING
+
+import diffrax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int
+
+from ..solution import AccuracyWarning, DAESolution
+from ..types import BoolScalar, IntScalar, Scalar
+
+
+if TYPE_CHECKING:
+    from .program import Solve
+
+# The errors of so many steps may add up to more than two digits are worth.
+MANY, PART = 1_000_000, 0.01
+
+
+class Doubt(enum.IntFlag):
+    """Why an answer may be off by more than was asked for."""
+
+    DRIFTED = 1
+    UNRESOLVED = 2
+    MANY_STEPS = 4
+
+
+_SENTENCES = {
+    Doubt.DRIFTED: (
+        "At its end the solution is off the constraints by more than a thousand tolerances: this formulation lets it drift, and "
+        "more so the longer it goes on. Use a method that keeps the constraints, such as OrthogonalProjection(DOP853()); "
+        "`dae_jax.drift` shows how far it is off."
+    ),
+    Doubt.UNRESOLVED: (
+        "The fixed steps are too large: their errors, as the method estimates them, add up to more than the solution itself, as "
+        "they do beyond a method's limit of stability. Take smaller steps, or let them be chosen (`dt0=None`)."
+    ),
+    Doubt.MANY_STEPS: (
+        "A million steps and more were taken, and the errors that the tolerance allows in each of them may add up to more than a "
+        "hundredth of the solution. Use a smaller tolerance or a method of higher order, and compare."
+    ),
+}
+
+
+def found(solve: "Solve", drifted: BoolScalar, steps: IntScalar, errors: Scalar | None) -> Int[Array, ""]:
+    """The doubts about a solve that went well, as bits; `errors`: of all fixed steps, as parts of the solution."""
+    many = jnp.asarray(False)
+    if isinstance(solve.controller, diffrax.AbstractAdaptiveStepSizeController):
+        rtol = jnp.max(jnp.asarray(getattr(solve.controller, "rtol")))  # noqa: B009
+        many = (steps >= MANY) & (steps * rtol > PART)
+    unresolved = jnp.asarray(False) if errors is None else errors > 1
+    bits = {Doubt.DRIFTED: drifted, Doubt.UNRESOLVED: unresolved, Doubt.MANY_STEPS: many}
+    return sum((jnp.where(on, int(bit), 0) for bit, on in bits.items()), jnp.zeros((), int))
+
+
+def warn(sol: DAESolution, stacklevel: int) -> None:
+    """Warns of the doubts about a solution that consists of numbers."""
+    doubts = int(np.asarray(sol.stats["doubts"]))
+    for bit, sentence in _SENTENCES.items():
+        if doubts & bit:
+            warnings.warn(sentence, AccuracyWarning, stacklevel=stacklevel + 1)

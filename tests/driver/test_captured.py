@@ -1,0 +1,272 @@
+"""A value that a function takes from around it, and that has changed between two calls, is seen: the second call gives what a
+function that was written anew gives.
+"""
+
+import functools
+import types
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dae_jax
+from dae_jax import ConstrainedSystem, OrthogonalProjection
+from dae_jax.driver import program
+from dae_jax.validate.captured import current
+
+
+SOLVER = OrthogonalProjection(diffrax.Tsit5())
+START = (jnp.array([1.0, 0.0]), jnp.zeros(2))
+K = 9.81
+TABLE = {"k": 9.81, "deeper": [{"k": 0.0}]}
+ARRAY = np.array([9.81])
+SETTINGS = types.ModuleType("settings")
+SETTINGS.k = 9.81
+
+
+class Spring:
+    def __init__(self, k):
+        self.k = k
+
+    def force(self, t, q, v, args):
+        return jnp.array([0.0, self.k])
+
+    def __call__(self, t, q, v, args):
+        return self.force(t, q, v, args)
+
+
+SPRING = Spring(9.81)
+
+
+def helper():
+    return K
+
+
+def circle(t, q, args):
+    return (q @ q - 1) / 2
+
+
+def along(k):
+    return jnp.array([0.0, k])
+
+
+class Case:
+    """A force that takes its value from somewhere, and how that is changed."""
+
+    def __init__(self, force, change):
+        self.force, self.change = force, change
+
+
+def of_a_closure():
+    k = 9.81
+
+    def change(x):
+        nonlocal k
+        k = x
+
+    return Case(lambda t, q, v, args: along(k), change)
+
+
+def of_a_partial():
+    table = {"k": 9.81}
+    return Case(functools.partial(lambda table, t, q, v, args: along(table["k"]), table), lambda x: table.update(k=x))
+
+
+def of_a_default():
+    table = {"k": 9.81}
+
+    def force(t, q, v, args, table=table):
+        return along(table["k"])
+
+    return Case(force, lambda x: table.update(k=x))
+
+
+def set_global(x):
+    globals()["K"] = x
+
+
+CASES = {
+    "a global": lambda: Case(lambda t, q, v, args: along(K), set_global),
+    "a global of a function that is called": lambda: Case(lambda t, q, v, args: along(helper()), set_global),
+    "a dictionary": lambda: Case(lambda t, q, v, args: along(TABLE["k"]), lambda x: TABLE.update(k=x)),
+    "a dictionary in a list": lambda: Case(
+        lambda t, q, v, args: along(9.81 + TABLE["deeper"][0]["k"]), lambda x: TABLE["deeper"][0].update(k=x - 9.81)
+    ),
+    "an array in place": lambda: Case(lambda t, q, v, args: along(ARRAY[0]), lambda x: ARRAY.fill(x)),
+    "an attribute": lambda: Case(lambda t, q, v, args: along(SPRING.k), lambda x: setattr(SPRING, "k", x)),
+    "a module": lambda: Case(lambda t, q, v, args: along(SETTINGS.k), lambda x: setattr(SETTINGS, "k", x)),
+    "a method": lambda: Case((spring := Spring(9.81)).force, lambda x: setattr(spring, "k", x)),
+    "an object that is called": lambda: Case(spring := Spring(9.81), lambda x: setattr(spring, "k", x)),
+    "a closure": of_a_closure,
+    "a partial": of_a_partial,
+    "a default": of_a_default,
+}
+
+
+@pytest.fixture(params=CASES)
+def case(request):
+    found = CASES[request.param]()
+    yield found
+    found.change(9.81)
+
+
+def end(system, **options):
+    return dae_jax.daesolve(system, SOLVER, 0.0, 1.0, None, START, **options).ys[0][-1]
+
+
+def test_in_a_solve(case):
+    system = ConstrainedSystem(case.force, circle)
+    before = end(system)
+    case.change(1.0)
+    assert np.array_equal(end(system), end(ConstrainedSystem(lambda t, q, v, args: jnp.array([0.0, 1.0]), circle)))
+    case.change(9.81)
+    assert np.array_equal(end(system), before)
+
+
+def test_nothing_is_compiled_again_where_nothing_has_changed(case):
+    system = ConstrainedSystem(case.force, circle)
+    end(system)
+    count = program._jitted._cache_size()
+    for _ in range(3):
+        end(system)
+    assert program._jitted._cache_size() == count
+
+
+def test_in_a_derivative_of_a_closure():
+    table = {"k": 1.0}
+
+    def loss(scale):
+        system = ConstrainedSystem(lambda t, q, v, args: scale * along(table["k"]), circle)
+        return end(system)[1]
+
+    before = jax.grad(loss)(1.0)
+    table["k"] = 2.0
+    assert jax.grad(loss)(1.0) == pytest.approx(float(jax.grad(lambda s: loss(s))(1.0)))
+    table["k"] = 1.0
+    assert jax.grad(loss)(1.0) == before
+    step = 1e-4
+    assert float(before) == pytest.approx(float(loss(1 + step) - loss(1 - step)) / (2 * step), rel=1e-5)
+
+
+class TestCounters:
+    """A function that counts its calls does not become another one by that."""
+
+    @pytest.fixture(params=["list", "dictionary", "nonlocal"])
+    def counted(self, request):
+        count, calls, table = 0, [], {"calls": 0}
+
+        def force(t, q, v, args):
+            nonlocal count
+            if request.param == "list":
+                calls.append(1)
+            elif request.param == "dictionary":
+                table["calls"] += 1
+            else:
+                count += 1
+            return jnp.array([0.0, 9.81])
+
+        return ConstrainedSystem(force, circle), lambda: count + len(calls) + table["calls"]
+
+    def test_a_solve(self, counted):
+        system, calls = counted
+        end(system)
+        before = calls()
+        end(system)
+        assert calls() == before
+
+    def test_a_gradient(self, counted):
+        system, calls = counted
+        gradient = jax.grad(lambda y: dae_jax.daesolve(system, SOLVER, 0.0, 1.0, None, (START[0], y)).ys[0][-1, 1])
+        for _ in range(3):
+            before = calls()
+            gradient(START[1])
+        assert calls() == before
+
+    def test_rank_that_is_found(self):
+        calls = []
+        system = ConstrainedSystem(
+            lambda t, q, v, args: calls.append(1) or jnp.array([0.0, 9.81]),
+            lambda t, q, args: jnp.stack([circle(t, q, args)] * 2),
+        )
+        end(system)
+        before = len(calls)
+        end(system)
+        assert len(calls) == before
+
+    def test_args(self):
+        table = {"k": 9.81}
+        system = ConstrainedSystem(lambda t, q, v, args: along(args()), circle)
+        before = end(system, args=lambda: table["k"])
+        fn = lambda: table["k"]
+        assert np.array_equal(end(system, args=fn), before)
+        table["k"] = 1.0
+        assert not np.array_equal(end(system, args=fn), before)
+
+
+class TestElsewhere:
+    """In everything that keeps what it has compiled."""
+
+    @pytest.fixture
+    def length(self):
+        """A constraint whose rod has a length that changes."""
+        table = {"length": 1.0}
+        return table, ConstrainedSystem(
+            lambda t, q, v, args: jnp.array([0.0, -9.81]), lambda t, q, args: q @ q - table["length"] ** 2
+        )
+
+    def test_start(self, length):
+        table, system = length
+        end(system)
+        table["length"] = 2.0
+        with pytest.raises(ValueError, match="violates"):
+            end(system)
+
+    def test_consistent_state(self, length):
+        table, system = length
+        assert np.allclose(dae_jax.consistent_state(system, 0.0, START)[0], [1, 0])
+        table["length"] = 2.0
+        assert np.allclose(dae_jax.consistent_state(system, 0.0, START)[0], [2, 0])
+
+    def test_drift_and_multipliers(self, length):
+        table, system = length
+        sol = dae_jax.daesolve(system, SOLVER, 0.0, 1.0, None, START)
+        assert float(dae_jax.drift(system, sol).position[-1]) < 1e-12
+        table["length"] = 2.0
+        assert float(dae_jax.drift(system, sol).position[-1]) == pytest.approx(3)
+
+    def test_sweep(self):
+        table = {"k": 9.81}
+        system = ConstrainedSystem(lambda t, q, v, args: along(table["k"]), circle)
+        fn = lambda scale: scale * end(system)[1]
+        before = dae_jax.sweep(fn, jnp.arange(2.0), progress=False)
+        table["k"] = 1.0
+        after = dae_jax.sweep(fn, jnp.arange(2.0), progress=False)
+        assert after[1] == pytest.approx(float(end(system)[1]), rel=1e-12)
+        assert abs(float(after[1] - before[1])) > 0.1
+
+
+def test_what_cannot_change_costs_nothing():
+    """A function without values around it, and one of this library, stay what they are."""
+    force = dae_jax.scenes.pendulum().system.force
+    assert current(circle) is circle
+    assert current(force) is force
+
+
+def test_a_network_is_known_by_its_weights():
+    network = eqx.nn.MLP(2, 2, 4, 1, key=jax.random.key(0))
+    fn = lambda t, q, v, args: network(q)
+    before = current(fn)
+    assert current(fn) == before
+    network = eqx.tree_at(lambda n: n.layers[0].bias, network, jnp.ones(4))
+    assert current(fn) != before
+
+
+def test_what_is_large_is_known_by_what_it_is():
+    many = [float(k) for k in range(100_000)]
+    fn = lambda: many[0]
+    assert current(fn) == current(fn)
+    many[0] = 1.0
+    assert current(fn) == current(fn)

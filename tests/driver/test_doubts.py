@@ -1,0 +1,71 @@
+"""Answers that no step has failed for, and that are not to be trusted: a warning says so, and `stats["doubts"]`."""
+
+import warnings
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import pytest
+
+import dae_jax
+from dae_jax import AccuracyWarning, ConstrainedSystem, OrthogonalProjection
+from dae_jax.driver import doubts
+from dae_jax.scenes import pendulum
+
+
+TSIT5 = OrthogonalProjection(diffrax.Tsit5())
+START = (jnp.array([1.0, 0.0]), jnp.zeros(2))
+
+
+def spring(omega):
+    """Along a straight line."""
+    return ConstrainedSystem(lambda t, q, v, args: -(omega**2) * q * jnp.array([1.0, 0.0]), lambda t, q, args: q[1])
+
+
+def solved(system, solver=TSIT5, t1=5.0, dt0=1e-3, y0=START, **options):
+    return dae_jax.daesolve(system, solver, 0.0, t1, dt0, y0, None, max_steps=None, **options)
+
+
+def of(sol):
+    return int(sol.stats["doubts"])
+
+
+@pytest.mark.parametrize("solver", [TSIT5, diffrax.Tsit5(), diffrax.Dopri5()], ids=lambda s: type(s).__name__)
+def test_fixed_steps_beyond_the_limit_of_stability(solver):
+    with pytest.warns(AccuracyWarning, match="fixed steps are too large"):
+        sol = solved(spring(1500.0), solver)
+    assert of(sol) == 2
+    assert not float(jnp.max(jnp.abs(sol.ys[0]))) < 1.1
+    assert of(solved(spring(50.0), solver)) == 0
+
+
+def test_drift_beyond_the_tolerances():
+    scene = pendulum()
+    with pytest.warns(AccuracyWarning, match="drift"):
+        sol = solved(scene.system, diffrax.Tsit5(), 500.0, None, scene.y0)
+    assert of(sol) == 1
+    assert float(dae_jax.drift(scene.system, sol).position[-1]) > 1e-5
+    assert of(solved(scene.system, TSIT5, 100.0, None, scene.y0)) == 0
+
+
+def test_very_many_steps(monkeypatch):
+    monkeypatch.setattr(doubts, "MANY", 100)
+    control = {"stepsize_controller": diffrax.PIDController(rtol=1e-4, atol=1e-4)}
+    with pytest.warns(AccuracyWarning, match="million steps"):
+        assert of(solved(spring(3.0), TSIT5, 100.0, None, **control)) == 4
+    monkeypatch.undo()
+    assert of(solved(spring(3.0), TSIT5, 101.0, None, **control)) == 0
+
+
+def test_in_a_batch_and_under_jit_it_is_a_number():
+    run = lambda omega: solved(spring(omega)).stats["doubts"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert jax.vmap(run)(jnp.array([50.0, 1500.0])).tolist() == [0, 2]
+        assert int(jax.jit(run)(1500.0)) == 2
+
+
+def test_a_solve_that_failed_has_none():
+    sol = solved(spring(1e6), throw=False)
+    assert int(sol.result._value) != 0
+    assert of(sol) == 0
