@@ -74,7 +74,7 @@ def _needed(jaxpr: ClosedJaxpr) -> tuple[ClosedJaxpr, list[bool]]:
     # Tangents of integers are no numbers. XLA aborts where a parameter of a kernel is not used.
     known = [v.aval.dtype != jax.dtypes.float0 for v in jaxpr.jaxpr.outvars]
     needed, used = dce_jaxpr(jaxpr.jaxpr, known)
-    return expanded(ClosedJaxpr(needed, jaxpr.consts)), used
+    return expanded(ClosedJaxpr(needed, jaxpr.consts), checks=False), used
 
 
 def as_kernel(fn: Callable[..., Any]) -> Callable[..., Any]:

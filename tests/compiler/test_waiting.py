@@ -8,11 +8,12 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix
 import pytest
 
 import dae_jax
 from dae_jax import scenes
-from dae_jax.compiler import equations, waiting, without_checks, xla_kernel
+from dae_jax.compiler import equations, kernel_call, waiting, without_checks, xla_kernel
 from dae_jax.compiler.emit import object_code
 from dae_jax.compiler.lower import annotate, compiled, hindrances
 from dae_jax.compiler.thresholds import THRESHOLDS
@@ -161,14 +162,63 @@ def test_inside_jit_there_is_no_time_to_tell():
     assert "compile_seconds" not in jax.jit(end)()
 
 
-def test_dummy_derivatives_of_a_mechanism_are_not_left_to_xla():
-    """The double pendulum: as it is traced it has more equations than are allowed, half of them there twice, and factorials."""
-    scene = scenes.double_pendulum()
+@pytest.mark.parametrize(
+    ("scene", "saveat"),
+    [
+        (scenes.double_pendulum(), diffrax.SaveAt(t1=True)),
+        (scenes.four_bar(), diffrax.SaveAt(ts=np.linspace(0, 1, 11))),
+    ],
+    ids=["double pendulum", "four bars"],
+)
+def test_dummy_derivatives_of_a_mechanism_are_not_left_to_xla(scene, saveat):
+    """As they are traced they have a multitude of equations, half of them there twice, and factorials."""
     solve, problem = prepared(
-        scene.system, diffrax.Tsit5(), 0.0, 1.0, None, scene.y0, None, dae_jax.DummyDerivatives(),
-        diffrax.SaveAt(t1=True), None, diffrax.RecursiveCheckpointAdjoint(), None, 4096, diffrax.NoProgressMeter(),
+        scene.system, dae_jax.DOP853(), 0.0, 1.0, None, scene.y0, None, dae_jax.DummyDerivatives(),
+        saveat, None, diffrax.RecursiveCheckpointAdjoint(), None, 4096, diffrax.NoProgressMeter(),
     )  # fmt: skip
     kernel, arrays = solve.kernel(problem)
     jaxpr = jax.make_jaxpr(without_checks(kernel))(arrays)
-    assert sum(v.aval.size for eqn in equations(jaxpr) for v in eqn.outvars) > THRESHOLDS.instructions
-    assert hindrances(jaxpr) == ()
+    assert sum(v.aval.size for eqn in equations(jaxpr) for v in eqn.outvars) > 60_000
+    assert kernel_call.decision(jaxpr).compiler == "llvm"
+
+
+@pytest.mark.parametrize("kind", ["event", "reset"])
+def test_the_derivative_of_an_event_is_not_left_to_xla(kind, monkeypatch):
+    """The linear solve in the derivative of its time looks at its result, which a kernel cannot."""
+    made_by = []
+    decided = kernel_call._decided
+    monkeypatch.setattr(kernel_call, "_decided", lambda *args: made_by.append(decided(*args)) or made_by[-1])
+    level = lambda t, y, args, **_: y[0][0] - 0.9
+    event, adjoint = diffrax.Event(level, optimistix.Newton(1e-8, 1e-8)), diffrax.RecursiveCheckpointAdjoint()
+    if kind == "reset":
+        event, adjoint = dae_jax.Reset(level, lambda t, y, args: ((y[0], -y[1]), args)), diffrax.ForwardMode()
+
+    system = dae_jax.ConstrainedSystem(lambda t, q, v, args: jnp.array([0.0, args]), SYSTEM.constraint)
+
+    def end(gravity):
+        y0 = (jnp.array([1.0, 0.0]), jnp.zeros(2))
+        sol = dae_jax.daesolve(
+            system,
+            dae_jax.OrthogonalProjection(diffrax.Tsit5()),
+            0.0,
+            2.0,
+            None,
+            y0,
+            gravity,
+            event=event,
+            adjoint=adjoint,
+        )
+        return sol.ts[-1] + sol.ys[0][-1, 0]
+
+    assert abs((jax.grad if kind == "event" else jax.jacfwd)(end)(9.81)) > 1e-3
+    assert {found.compiler for found in made_by} == {"llvm"}
+
+
+def test_passes_are_run_where_they_gain_more_than_they_take():
+    address, loop = "%p = getelementptr double, ptr %a, i64 %i\n", "%c = icmp ult i64 %i, 26\n"
+    many = object_code.ADDRESSES
+    assert object_code._gains_by_passes(address * (many - 1))
+    assert not object_code._gains_by_passes(address * many)
+    assert object_code._gains_by_passes(address * many + loop * (many // object_code.PER_LOOP + 1))
+    assert not object_code._gains_by_passes(address * many + loop.replace("26", "8") * many)
+    assert not object_code._gains_by_passes("\n" * object_code.HEAVY)

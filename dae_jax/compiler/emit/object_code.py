@@ -2,6 +2,7 @@
 
 import hashlib
 import importlib.metadata
+import re
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -17,16 +18,36 @@ if TYPE_CHECKING:
 # functions by it; with that of loops.
 SPEED = 2
 BY_VECTORS = (False, True)
-# Modules of more lines become machine code as they are: LLVM's passes would take 6 s and more. Straight-line code, as it is
-# written for an explicit method, they hardly make faster; Andrews' mechanism by Radau (39,000 lines) takes 24 ms without them, 8
-# with.
+# Modules of more lines become machine code as they are: LLVM's passes would take 6 s and more.
 HEAVY = 45_000
+# And modules that compute so many addresses, unless one of `PER_LOOP` is in a loop of `LONG` turns or more. What LLVM's passes take
+# grows with the memory that is written to, what they gain comes from long loops: the double pendulum by dummy derivatives (6,000
+# addresses, 46 long loops) is ready in 4.6 s without them and in 8.1 with, and takes 3.6 and 2.9 ms; Andrews' mechanism by Radau
+# (7,000 and 340) in 6 and 12 s, and takes 49 and 22 ms.
+ADDRESSES, PER_LOOP, LONG = 5_000, 50, 25
+
+
+# The last index of a loop over an array.
+_TURNS = re.compile(r"icmp \w+ i64 %\S+, (\d+)")
 
 
 def key(text: str, target: Target, passes: bool) -> str:
     """What object code depends on: the module, the target, the passes, and the versions of all that is involved."""
     versions = (importlib.metadata.version(name) for name in ("dae_jax", "llvmlite"))
-    made = (*versions, llvm().llvm_version_info, VERSION, target, passes, SPEED, BY_VECTORS, HEAVY, text)
+    made = (
+        *versions,
+        llvm().llvm_version_info,
+        VERSION,
+        target,
+        passes,
+        SPEED,
+        BY_VECTORS,
+        HEAVY,
+        ADDRESSES,
+        PER_LOOP,
+        LONG,
+        text,
+    )
     return hashlib.sha256(repr(made).encode()).hexdigest()
 
 
@@ -38,10 +59,11 @@ def object_code(
 
     Errors: `Unsupported` for a module that is broken.
     """
-    machine = target.machine(3 if passes else 0)
+    optimised = passes and _gains_by_passes(text)
+    machine = target.machine(3 if optimised else int(passes))
     try:
         module = parsed(text)
-        if passes and text.count("\n") < HEAVY:
+        if optimised:
             _optimise(module, machine)
     except RuntimeError as error:
         raise Unsupported(f"LLVM: {error}") from error
@@ -50,6 +72,16 @@ def object_code(
         # A module of its own: making assembly changes it.
         show("s", machine.emit_assembly(parsed(str(module))))
     return machine.emit_object(module)
+
+
+def _gains_by_passes(text: str) -> bool:
+    """Whether LLVM's passes gain more than they take."""
+    if text.count("\n") >= HEAVY:
+        return False
+    addresses = text.count("getelementptr")
+    if addresses < ADDRESSES:
+        return True
+    return PER_LOOP * sum(int(turns) >= LONG for turns in _TURNS.findall(text)) > addresses
 
 
 def parsed(text: str) -> Any:

@@ -32,8 +32,9 @@ WITH_DERIVATIVE = {"custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jax
 # Every primitive that calls a jaxpr, with the parameter that has it.
 ALL_CALLS = {**CALLS, **WITH_DERIVATIVE, "custom_vmap_call": "call"}
 
-# Parameters that hold no jaxpr.
-_PLAIN = int | float | str | np.dtype | np.generic | enum.Enum | None
+# Parameters that hold no jaxpr; most are of the first, which are told at a glance.
+_PLAIN = frozenset({int, bool, float, str, type(None)})
+_PLAIN_KINDS = int | float | str | np.dtype | np.generic | enum.Enum | None
 
 
 def equations(jaxpr: ClosedJaxpr | Jaxpr) -> Iterator[Any]:
@@ -45,8 +46,10 @@ def equations(jaxpr: ClosedJaxpr | Jaxpr) -> Iterator[Any]:
 
 def equations_in(eqn: Equation) -> Iterator[Any]:
     """The equations of all jaxprs that an equation holds."""
-    for jaxpr in jaxprs_in(tuple(eqn.params.values())):
-        yield from equations(jaxpr)
+    for param in eqn.params.values():
+        if type(param) not in _PLAIN:
+            for jaxpr in jaxprs_in(param):
+                yield from equations(jaxpr)
 
 
 def jaxprs_in(param: object) -> Iterator[ClosedJaxpr | Jaxpr]:
@@ -55,8 +58,9 @@ def jaxprs_in(param: object) -> Iterator[ClosedJaxpr | Jaxpr]:
         yield param
     elif isinstance(param, tuple | list):
         for x in param:
-            yield from jaxprs_in(x)
-    elif not isinstance(param, _PLAIN):
+            if type(x) not in _PLAIN:
+                yield from jaxprs_in(x)
+    elif not isinstance(param, _PLAIN_KINDS):
         is_jaxpr = lambda x: isinstance(x, ClosedJaxpr | Jaxpr)
         yield from filter(is_jaxpr, jax.tree.leaves(param, is_leaf=is_jaxpr))
 

@@ -33,6 +33,8 @@ def unsupported(jaxpr: ClosedJaxpr, batched: tuple[bool, ...] = ()) -> tuple[Uns
     judged, inlined = annotate(jaxpr, batched), Inlining()
     if isinstance(judged, Annotated):
         return ()
+    if judged.primitive == "size":
+        return (judged,)
     return tuple(_unsupported(inlined(without_keys(jaxpr)), inlined)) or (judged,)
 
 

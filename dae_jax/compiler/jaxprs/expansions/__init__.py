@@ -16,6 +16,7 @@ from jaxtyping import Array
 
 from ...types import Arrays, DType, Equation
 from ..rewriting import Rewriting
+from ..unchecked import checks_dropped
 from ..walk import equations
 from .factorisations import cholesky, lu, lu_pivots_to_permutation
 from .orthogonal import geqrf, householder_product, qr
@@ -48,15 +49,17 @@ EXPANSIONS: dict[str, Callable[..., Any]] = {
 _LINEAR_SOLVE = "linear_solve"
 
 
-def expanded(closed: ClosedJaxpr) -> ClosedJaxpr:
-    """The same function without the primitives of the table, at any depth."""
+def expanded(closed: ClosedJaxpr, checks: bool = True) -> ClosedJaxpr:
+    """The same function without the primitives of the table, at any depth; without `checks`, those that come to light are left
+    out: what is singular then gives what is not finite.
+    """
     if not any(map(_is_expanded, equations(closed))):
         return closed
 
     def fn(*args: Array) -> list[Any]:
         return rewriting.run(closed.jaxpr, closed.consts, args, [])[0]
 
-    rewriting = Rewriting(_is_expanded, lambda eqn, args, state: (_results(eqn, args), state))
+    rewriting = Rewriting(_is_expanded, lambda eqn, args, state: (_results(eqn, args, checks), state))
     return jax.make_jaxpr(fn)(*closed.in_avals)
 
 
@@ -64,10 +67,11 @@ def _is_expanded(eqn: Equation) -> bool:
     return eqn.primitive.name in EXPANSIONS or eqn.primitive.name == _LINEAR_SOLVE
 
 
-def _results(eqn: Equation, args: Arrays) -> list[Any]:
+def _results(eqn: Equation, args: Arrays, checks: bool) -> list[Any]:
     name, params = eqn.primitive.name, eqn.primitive.get_bind_params(eqn.params)
     if name in EXPANSIONS:
         out = EXPANSIONS[name](*args, **params)
         return list(out) if eqn.primitive.multiple_results else [out]
-    inner = expanded(jax.make_jaxpr(lambda *xs: eqn.primitive.impl(*xs, **params))(*args))
+    inner = jax.make_jaxpr(lambda *xs: eqn.primitive.impl(*xs, **params))(*args)
+    inner = expanded(inner if checks else checks_dropped(inner), checks)
     return eval_jaxpr(inner.jaxpr, inner.consts, *args)
