@@ -75,8 +75,8 @@ def daesolve(
       float32).
     - `saveat`, `adjoint`, `event`, `max_steps`, `throw`, `progress_meter`: as in diffrax. Functions in `saveat` and
       `event` get the state in the structure of `y0`, and the user's `args`. With a `Reset` as `event` the solve goes on
-      after it. Second derivatives are there in any order of modes, third ones with `jax.jacfwd` outside; with a `Reset`,
-      a progress meter or without one kernel forward-mode derivatives need `adjoint=diffrax.ForwardMode()`.
+      after it. Second derivatives are there in any order of modes, third ones with `jax.jacfwd` outside; with a
+      progress meter or without one kernel forward-mode derivatives need `adjoint=diffrax.ForwardMode()`.
 
     **Returns** a `DAESolution`.
 
@@ -141,6 +141,7 @@ def prepared(
     dtype = jnp.result_type(*jax.tree.leaves(y0))
     if stepsize_controller is None:
         stepsize_controller = _default_controller(dt0, dtype)
+    stepsize_controller = jax.tree.map(lambda x: as_array(x, dtype) if _is_real(x) else x, stepsize_controller)
     start, end, step = as_array(t0, dtype), as_array(t1, dtype), None if dt0 is None else as_array(dt0, dtype)
     saveat = jax.tree.map(lambda x: as_array(x, dtype) if isinstance(x, np.ndarray | jax.Array) else x, saveat)
     if event is not None:
@@ -210,6 +211,10 @@ def _with_rank(program: Program, solve: Solve, problem: Problem) -> Program:
     for oldest in list(_of_known_rank)[:-KEPT]:
         _of_known_rank.pop(oldest, None)
     return better
+
+
+def _is_real(x: object) -> bool:
+    return isinstance(x, np.ndarray | np.generic | jax.Array) and bool(jnp.issubdtype(x.dtype, jnp.floating))
 
 
 def _default_controller(dt0: Time | None, dtype: DType) -> diffrax.AbstractStepSizeController:

@@ -21,7 +21,7 @@ from jaxtyping import Array, PyTree
 from . import fallbacks, lower, waiting, xla_kernel
 from ._compat import dce_jaxpr, setting
 from .check import checked
-from .jaxprs.expansions import expanded
+from .jaxprs.expansions import expanded, kernel_written_out
 from .jaxprs.scalar_interpreter import Unsupported
 from .jaxprs.unchecked import checks_dropped
 from .settings import current
@@ -131,7 +131,7 @@ def _bind(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Sequence[Array]) ->
 def _(*args: Array, **params: Any) -> Any:
     # JAX looks for what is not a number by calling a function without compiling it, again where that compiles.
     if any(map(setting, ("jax_disable_jit", "jax_debug_nans", "jax_debug_infs"))):
-        return _plain(*args, **params)
+        return kernel_written_out(*args, **params)
     return jax.jit(lambda *xs: kernel_p.bind(*xs, **params))(*args)
 
 
@@ -155,7 +155,9 @@ def _lowered(args: Sequence[Array], jaxpr: ClosedJaxpr, lanes: tuple[bool, ...])
     if ours is None:
         return _by_xla(jaxpr, lanes, args)
     if current().check:
-        return checked(ours, jax.jit(lambda *xs: _plain(*xs, jaxpr=jaxpr, lanes=lanes))(*args), current().check)
+        return checked(
+            ours, jax.jit(lambda *xs: kernel_written_out(*xs, jaxpr=jaxpr, lanes=lanes))(*args), current().check
+        )
     return ours
 
 
@@ -191,13 +193,8 @@ def _in_turn(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Sequence[Array])
     return jax.lax.map(one_lane, tuple(x for x, b in zip(args, lanes, strict=True) if b))
 
 
-def _plain(*args: Array, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> list[Any]:
-    fn: Callable[..., list[Any]] = jaxpr_as_fun(jaxpr)
-    return jax.vmap(fn, in_axes=[0 if b else None for b in lanes])(*args) if lanes else fn(*args)
-
-
 mlir.register_lowering(kernel_p, mlir.lower_fun(_lower, multiple_results=True), platform="cpu")
-mlir.register_lowering(kernel_p, mlir.lower_fun(_plain, multiple_results=True))
+mlir.register_lowering(kernel_p, mlir.lower_fun(kernel_written_out, multiple_results=True))
 
 
 def _batch(

@@ -15,6 +15,8 @@ from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
 
 from .._compat import while_loop
+from ..compiler import one_kernel
+from ..compiler.types import Arrays
 from ..consistent import consistent_state
 from ..equations.constraint_jacobian import Rank
 from ..equations.structural_ode import underlying_ode
@@ -23,7 +25,7 @@ from ..systems import System
 from ..types import Args, BoolLike, Scalar, State, Time, Y
 from ..validate.states import NUMBERS, brief, broadcast_to_state, describe
 from ..validate.user_functions import refuse_other_arguments, returned
-from .problem import Problem, count_of
+from .problem import Problem, Split, count_of, split
 from .start import saved_parts
 
 
@@ -165,6 +167,17 @@ class _Progress(NamedTuple):
 
 def solve_with_resets(solve: "Solve", problem: Problem) -> tuple[DAESolution, Any]:
     """What `solve` gives, part by part; `solve.event` is a `Reset`."""
+
+    def parts(solve: "Solve") -> tuple[Callable[[Arrays], Split], Arrays]:
+        program, arrays = split((solve, problem))
+        return lambda arrays: Split.of(_part_by_part(*program.whole(arrays))), arrays
+
+    forward, _ = parts(dataclasses.replace(solve, adjoint=diffrax.ForwardMode()))
+    numbers, arrays = parts(solve)
+    return one_kernel(numbers, solve.derivative(), None, forward)(arrays).whole()
+
+
+def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Any]:
     system, t0, y0, args = problem.start
     t1, rank = problem.t1, problem.rank
     reset, (output,) = solve.event, saved_parts(solve.saveat)

@@ -346,3 +346,18 @@ def test_a_value_that_is_the_same_for_a_batch_has_its_shape_within_derivatives()
         for slope in (jax.grad, jax.jacfwd):
             found = slope(lambda k: jax.vmap(jax.jit(value))(jnp.stack([k, 2 * k])).sum())(1.5)
             np.testing.assert_allclose(found, 17 * 8 * 1.5**3, rtol=1e-14)
+
+
+def test_a_kernel_within_a_kernel_is_a_part_of_it():
+    """A solve of this library in a function that is compiled, with its derivatives and its batch."""
+    circle = lambda t, q, args: (q @ q - 1) / 2
+    system = dae_jax.ConstrainedSystem(lambda t, q, v, args: args * jnp.array([0.0, 1.0]), circle)
+    solver, y0 = dae_jax.OrthogonalProjection(diffrax.Tsit5()), (jnp.array([1.0, 0.0]), jnp.zeros(2))
+    end = lambda g: dae_jax.daesolve(system, solver, 0.0, 2.0, None, y0, g, throw=False).ys[0][-1, 0]
+    ours, gs = jit(end), jnp.array([9.81, 5.0, 1.0])
+    assert ours.lower(9.81).compiler == "llvm"
+    for of in (lambda f: f, jax.grad, jax.hessian):
+        np.testing.assert_allclose(of(ours)(9.81), of(end)(9.81), rtol=1e-8)
+        np.testing.assert_allclose(jax.vmap(of(ours))(gs), [of(end)(g) for g in gs], rtol=1e-8)
+    total = lambda f: lambda a: jnp.sum(jax.vmap(f)(a * gs))
+    np.testing.assert_allclose(jax.grad(total(ours))(1.0), jax.grad(total(end))(1.0), rtol=1e-8)

@@ -61,6 +61,24 @@ def test_derivatives_through_jumps():
     np.testing.assert_allclose(forward, exact, rtol=1e-6)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "order",
+    [jax.hessian, lambda f: jax.grad(jax.grad(f)), lambda f: jax.jacfwd(jax.jacfwd(f))],
+    ids=["hessian", "gradients", "forward"],
+)
+def test_second_derivatives_through_jumps_without_another_adjoint(order):
+    h = 1e-4
+    exact = (height(0.9 + h, 2.2) - 2 * height(0.9, 2.2) + height(0.9 - h, 2.2)) / h**2
+    np.testing.assert_allclose(order(lambda e: bouncing(e, 2.2).ys[0][-1, 1])(0.9), exact, rtol=1e-5)
+
+
+def test_forward_derivatives_are_those_of_the_default_adjoint():
+    end = lambda e: bouncing(e, 2.2).ys[0][-1, 1]
+    _, forward = jax.jvp(end, (0.9,), (1.0,))
+    np.testing.assert_allclose(forward, jax.grad(end)(0.9), rtol=1e-12)
+
+
 def test_batch_is_one_at_a_time():
     end = lambda e: bouncing(e, 2.2).ys[0][-1, 1]
     together = jax.vmap(lambda e: bouncing(e, 2.2, throw=False))(jnp.array([0.2, 0.8, 0.9]))

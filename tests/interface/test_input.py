@@ -266,3 +266,15 @@ def test_a_force_in_float64_does_not_disturb_a_state_in_float32():
     assert sol.ys[0].dtype == jnp.float32
     exact = dae_jax.scenes.pendulum().reference(np.array([1.0]))
     np.testing.assert_allclose(sol.ys[0], exact[0], atol=1e-4)
+
+
+def test_tolerances_take_the_precision_of_the_state():
+    """Traced numbers of float64 beside a state of float32."""
+    y0 = (jnp.array([1.0, 0.0], jnp.float32), jnp.zeros(2, jnp.float32))
+    system = dae_jax.ConstrainedSystem(lambda t, q, v, args: jnp.zeros_like(q), lambda t, q, args: (q @ q - 1) / 2)
+
+    def end(rtol):
+        control = diffrax.PIDController(rtol=rtol, atol=np.float64(1e-5))
+        return dae_jax.daesolve(system, diffrax.Tsit5(), 0.0, 1.0, None, y0, stepsize_controller=control).ys[0]
+
+    assert jax.jit(end)(jnp.float64(1e-5)).dtype == jnp.float32

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import eval_jaxpr
-from jax.extend.core import ClosedJaxpr
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array
 
 from ...types import Arrays, DType, Equation
@@ -33,6 +33,12 @@ def _empty(*, dtype: DType, **_: object) -> Any:
     return jnp.zeros((), dtype)
 
 
+def kernel_written_out(*args: Array, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> list[Any]:
+    """What a kernel computes, as the equations that it was made from; within another kernel it is a part of that."""
+    fn: Callable[..., list[Any]] = jaxpr_as_fun(jaxpr)
+    return jax.vmap(fn, in_axes=[0 if b else None for b in lanes])(*args) if lanes else fn(*args)
+
+
 EXPANSIONS: dict[str, Callable[..., Any]] = {
     "cholesky": cholesky,
     "empty2": _empty,
@@ -40,13 +46,16 @@ EXPANSIONS: dict[str, Callable[..., Any]] = {
     "householder_product": householder_product,
     "lu": lu,
     "lu_pivots_to_permutation": lu_pivots_to_permutation,
+    # equinox's mark of what is not to be transformed any more; what is written out may be.
+    "nontraceable": lambda x, **_: x,
+    "one_kernel": kernel_written_out,
     "platform_index": _platform_index,
     "qr": qr,
     "sort": sort,
     "triangular_solve": triangular_solve,
 }
-# lineax's: what it does shows where it is evaluated.
-_LINEAR_SOLVE = "linear_solve"
+# lineax's, and derivatives of kernels: what they do shows where they are evaluated.
+_EVALUATED = frozenset({"linear_solve", "linear_map"})
 
 
 def expanded(closed: ClosedJaxpr, checks: bool = True) -> ClosedJaxpr:
@@ -64,7 +73,7 @@ def expanded(closed: ClosedJaxpr, checks: bool = True) -> ClosedJaxpr:
 
 
 def _is_expanded(eqn: Equation) -> bool:
-    return eqn.primitive.name in EXPANSIONS or eqn.primitive.name == _LINEAR_SOLVE
+    return eqn.primitive.name in EXPANSIONS or eqn.primitive.name in _EVALUATED
 
 
 def _results(eqn: Equation, args: Arrays, checks: bool) -> list[Any]:
