@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from typing import Any
 
 import diffrax
 import jax
@@ -139,16 +140,15 @@ def prepared(
     elif formulation.selects_states:
         solver = SelectedStates(solver)
     dtype = jnp.result_type(*jax.tree.leaves(y0))
-    if stepsize_controller is None:
-        stepsize_controller = _default_controller(dt0, dtype)
-    stepsize_controller = jax.tree.map(lambda x: as_array(x, dtype) if _is_real(x) else x, stepsize_controller)
+    controller: Any = stepsize_controller or _default_controller(dt0, dtype)
+    controller = jax.tree.map(lambda x: as_array(x, dtype) if _is_real(x) else x, controller)
     start, end, step = as_array(t0, dtype), as_array(t1, dtype), None if dt0 is None else as_array(dt0, dtype)
     saveat = jax.tree.map(lambda x: as_array(x, dtype) if isinstance(x, np.ndarray | jax.Array) else x, saveat)
     if event is not None:
         refuse_no_event(solver)
     if isinstance(event, Reset):
         refuse_other_outputs(saveat)
-    solve = Solve(formulation, solver, saveat, stepsize_controller, adjoint, event, progress_meter, max_steps)
+    solve = Solve(formulation, solver, saveat, controller, adjoint, event, progress_meter, max_steps)
     return solve, Problem(system, start, end, step, y0, args, getattr(system, "rank", None))
 
 

@@ -20,8 +20,8 @@ from .types import Equation
 # `linear_solve` does, and checks, shows only when it is compiled.
 _REFUSED = frozenset(
     "all_gather all_to_all approx_top_k cholesky conv_general_dilated custom_call debug_callback eig eigh ffi_call "
-    "fft geqrf hessenberg householder_product infeed io_callback linear_map linear_solve lu one_kernel ormqr outfeed ppermute psum pure_callback qr "
-    "random_gamma schur sort svd threefry2x32 top_k triangular_solve tridiagonal tridiagonal_solve".split()
+    "fft geqrf hessenberg householder_product infeed io_callback linear_map linear_solve lu one_kernel ormqr outfeed ppermute psum "
+    "pure_callback qr random_gamma schur sort svd threefry2x32 top_k triangular_solve tridiagonal tridiagonal_solve".split()
 )
 _REDUCTIONS = frozenset("reduce_sum reduce_max reduce_min reduce_prod reduce_and reduce_or".split())
 # More equations than these take XLA longer as one kernel than as many, and the longer the more: 2,534: 1.8 s and 3.1 s; 4,672:
