@@ -7,14 +7,18 @@
     daesolve(system, ...)
 
 A compiled program is known by its functions. Here each of them becomes one that is equal to itself only as long as the numbers,
-arrays, containers, functions and attributes of objects are that it finds in its closure, its defaults, the globals it names, and
-the object that it is a method of.
+arrays, containers, functions, classes and attributes of objects are that it finds in its closure, its defaults, the globals and
+modules it names, and the object that it is a method of.
 """
 
 import functools
 import hashlib
+import sys
+import sysconfig
 import types
-from collections.abc import Callable, Hashable, Iterable, Iterator
+from array import array
+from collections import deque
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence, Set
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -30,6 +34,11 @@ LIBRARIES = frozenset(
 )
 # Containers and objects with more in them are known by what they are, not by what is in them.
 MOST = 2000
+_CONTAINERS = frozenset({list, tuple, dict, set, frozenset, deque, array})
+# What Python keeps with every class, and what changes without meaning.
+_OF_EVERY_CLASS = frozenset(
+    "__dict__ __weakref__ __module__ __doc__ __qualname__ __slots__ __annotations__ __abstractmethods__ _abc_impl".split()
+)
 # How many functions are remembered that have changed what is around them.
 REMEMBERED = 1024
 _before: dict["Captured", "Captured"] = {}
@@ -108,7 +117,7 @@ def _of_library(x: object) -> bool:
     if isinstance(x, functools.partial):
         return False
     module = getattr(x, "__module__", None) or getattr(type(x), "__module__", "")
-    return isinstance(module, str) and module.partition(".")[0] in LIBRARIES
+    return isinstance(module, str) and _is_library(module)
 
 
 class _TooMuch(Exception):
@@ -116,10 +125,11 @@ class _TooMuch(Exception):
 
 
 class _Look:
-    """One look at all that a function can reach; `seen` are the objects on the way here."""
+    """One look at all that a function can reach; `seen` are the objects on the way here, `modules` those looked at."""
 
     def __init__(self) -> None:
         self.seen: list[object] = []
+        self.modules: list[types.ModuleType] = []
         self.count = 0
 
     def of_callable(self, x: Any) -> Hashable:
@@ -138,9 +148,10 @@ class _Look:
         code = fn.__code__
         for name, cell in zip(code.co_freevars, fn.__closure__ or (), strict=True):
             try:
-                yield from self._named(name, cell.cell_contents)
+                x = cell.cell_contents
             except ValueError:  # a name that has no value yet
                 continue
+            yield from self._named(name, x, _names(code))
         for k, x in enumerate(fn.__defaults__ or ()):
             yield from self._named(f"default {k}", x)
         for name, x in (fn.__kwdefaults__ or {}).items():
@@ -149,64 +160,107 @@ class _Look:
     def globals(self, fn: Any) -> Iterator[tuple[str, Hashable]]:
         names, there = _names(fn.__code__), fn.__globals__
         for name in names:
-            if name not in there:
-                continue
-            x = there[name]
-            if not isinstance(x, types.ModuleType):
-                yield from self._named(name, x)
-            elif x.__name__.partition(".")[0] not in LIBRARIES:
-                for attribute in names:
-                    if attribute in vars(x):
-                        yield from self._named(f"{name}.{attribute}", vars(x)[attribute])
+            if name in there:
+                yield from self._named(name, there[name], names)
+            elif name in sys.modules:  # that the function imports, perhaps
+                yield from self._named(name, sys.modules[name], names)
 
-    def _named(self, name: str, x: object) -> Iterator[tuple[str, Hashable]]:
-        found = self.value(x)
-        if found is not None:
-            yield name, found
+    def _named(self, name: str, x: object, names: tuple[str, ...] = ()) -> Iterator[tuple[str, Hashable]]:
+        """A value under its name; of a module, those under `names` in it."""
+        if not isinstance(x, types.ModuleType):
+            yield name, self.value(x)
+        elif x not in self.modules and not _is_library(x.__name__):
+            self.modules.append(x)
+            for attribute in names:
+                if attribute in vars(x):
+                    yield from self._named(f"{name}.{attribute}", vars(x)[attribute], names)
 
     def value(self, x: Any) -> Hashable:
-        """`None` for what has no value that could change."""
+        """What is equal as long as `x` is the same, and has the same in it."""
         if x is None or isinstance(x, bool | int | str | bytes | complex):
             return type(x), x
         if isinstance(x, float):
             return float, x.hex()
         if isinstance(x, np.ndarray | np.generic):
             return _of_numbers(np.asarray(x))
-        if isinstance(x, jax.Array):
+        if isinstance(x, jax.Array | types.ModuleType):
             return Same(x)
-        module = isinstance(x, eqx.Module)
-        if isinstance(x, types.ModuleType | type) or (not module and callable(x) and _of_library(x)):
-            return None
+        if isinstance(x, type):
+            return Same(x) if _is_installed(x.__module__) else self._guarded(x, self._of_class)
+        if not isinstance(x, eqx.Module) and callable(x) and _of_library(x):
+            return Same(x)
+        return self._guarded(x, self._of_parts)
+
+    def _guarded(self, x: object, look: Callable[[Any], Hashable]) -> Hashable:
         if any(x is outer for outer in self.seen):
             return "within itself"
+        if not self.seen:
+            self.count = 0
         self.seen.append(x)
         try:
-            return self._of_parts(x)
+            return look(x)
+        except _TooMuch:
+            if len(self.seen) > 1:
+                raise
+            return Same(x)
         finally:
             self.seen.pop()
 
     def _of_parts(self, x: Any) -> Hashable:
-        if len(self.seen) == 1:
-            self.count = 0
-        try:
-            if isinstance(x, tuple | list):
-                return (type(x), *map(self._counted, x))
-            if isinstance(x, dict):
-                return (dict, *((Same(k) if k.__hash__ is None else k, self._counted(y)) for k, y in x.items()))
-            if isinstance(x, types.FunctionType | types.MethodType | functools.partial):
-                return Same(getattr(x, "__func__", x)), self.of_callable(x)
-            if isinstance(x, eqx.Module) or (hasattr(x, "__dict__") and not _of_library(x)):
-                return (Same(type(x)), *((name, self._counted(y)) for name, y in vars(x).items()))
-        except _TooMuch:
-            if len(self.seen) > 1:
-                raise
-        return Same(x)
+        if isinstance(x, types.FunctionType | types.MethodType | functools.partial):
+            return Same(getattr(x, "__func__", x)), self.of_callable(x)
+        if isinstance(x, property):
+            return tuple(map(self._counted, (x.fget, x.fset)))
+        if isinstance(x, staticmethod | classmethod):
+            return self._counted(x.__func__)
+        found: list[Hashable] = []
+        if isinstance(x, Mapping):
+            found += [(Same(k) if k.__hash__ is None else k, self._counted(y)) for k, y in x.items()]
+        elif isinstance(x, Set):
+            found.append(frozenset(map(self._counted, x)))
+        elif isinstance(x, Sequence):
+            found += map(self._counted, x)
+        of_library = _of_library(x) and not isinstance(x, eqx.Module)
+        attributes = {} if of_library else _attributes(x)
+        if not found and not attributes and type(x) not in _CONTAINERS:
+            return Same(x), self.value(type(x))
+        found += [(name, self._counted(y)) for name, y in attributes.items()]
+        return self.value(type(x)), *found
+
+    def _of_class(self, x: type) -> Hashable:
+        own = ((name, y) for name, y in vars(x).items() if name not in _OF_EVERY_CLASS)
+        return Same(x), *((name, self._counted(y)) for name, y in own), *map(self._counted, x.__bases__)
 
     def _counted(self, x: object) -> Hashable:
         self.count += 1
         if self.count > MOST:
             raise _TooMuch
         return self.value(x)
+
+
+def _attributes(x: object) -> dict[str, Any]:
+    """An object's own attributes, also those that its classes have slots for."""
+    slots = [name for of in type(x).__mro__ for name in _tuple(vars(of).get("__slots__", ()))]
+    found = {name: getattr(x, name) for name in slots if name not in _OF_EVERY_CLASS and hasattr(x, name)}
+    return found | getattr(x, "__dict__", {})
+
+
+def _tuple(x: Any) -> tuple[str, ...]:
+    return (x,) if isinstance(x, str) else tuple(x)
+
+
+@functools.cache
+def _is_library(module: str) -> bool:
+    return module.partition(".")[0] in LIBRARIES
+
+
+@functools.cache
+def _is_installed(module: str) -> bool:
+    """Whether the classes of a module come with Python or with a package: they do not change."""
+    place = getattr(sys.modules.get(module), "__file__", None)
+    if _is_library(module) or module in sys.stdlib_module_names or "site-packages" in str(place):
+        return True
+    return str(place).startswith(sysconfig.get_path("stdlib"))
 
 
 def _of_numbers(x: np.ndarray) -> Hashable:

@@ -2,7 +2,10 @@
 function that was written anew gives.
 """
 
+import array
+import collections
 import functools
+import sys
 import types
 
 import diffrax
@@ -53,6 +56,46 @@ def along(k):
     return jnp.array([0.0, k])
 
 
+class Slotted:
+    __slots__ = ("k",)
+
+
+class OfClass:
+    k = 9.81
+
+    @property
+    def doubled(self):
+        return 2 * TABLE["k"]
+
+    def of_global(self):
+        return K
+
+
+OF_CLASS = OfClass()
+LAW = jnp.cos
+
+
+def set_law(x):
+    globals()["LAW"] = {9.81: jnp.cos}.get(x, jnp.sin)
+
+
+def importing(t, q, v, args):
+    import settings_of_a_test  # pyright: ignore[reportMissingImports]
+
+    return along(settings_of_a_test.k)
+
+
+sys.modules["settings_of_a_test"] = SETTINGS
+SLOTTED, DEQUE, SET, NUMBERS = Slotted(), collections.deque([9.81]), {9.81}, array.array("d", [9.81])
+SLOTTED.k = 9.81
+PROXY = types.MappingProxyType(TABLE)
+
+
+def set_of_one(x):
+    SET.clear()
+    SET.add(x)
+
+
 class Case:
     """A force that takes its value from somewhere, and how that is changed."""
 
@@ -100,6 +143,18 @@ CASES = {
     "a module": lambda: Case(lambda t, q, v, args: along(SETTINGS.k), lambda x: setattr(SETTINGS, "k", x)),
     "a method": lambda: Case((spring := Spring(9.81)).force, lambda x: setattr(spring, "k", x)),
     "an object that is called": lambda: Case(spring := Spring(9.81), lambda x: setattr(spring, "k", x)),
+    "slots": lambda: Case(lambda t, q, v, args: along(SLOTTED.k), lambda x: setattr(SLOTTED, "k", x)),
+    "a deque": lambda: Case(lambda t, q, v, args: along(DEQUE[0]), lambda x: DEQUE.__setitem__(0, x)),
+    "a set": lambda: Case(lambda t, q, v, args: along(max(SET)), set_of_one),
+    "an array of Python's": lambda: Case(lambda t, q, v, args: along(NUMBERS[0]), lambda x: NUMBERS.__setitem__(0, x)),
+    "a view of a dictionary": lambda: Case(lambda t, q, v, args: along(PROXY["k"]), lambda x: TABLE.update(k=x)),
+    "a class": lambda: Case(lambda t, q, v, args: along(OfClass.k), lambda x: setattr(OfClass, "k", x)),
+    "the class of an object": lambda: Case(
+        lambda t, q, v, args, of=OF_CLASS: along(of.k), lambda x: setattr(OfClass, "k", x)
+    ),
+    "a property": lambda: Case(lambda t, q, v, args, of=OF_CLASS: along(of.doubled / 2), lambda x: TABLE.update(k=x)),
+    "a global of a method": lambda: Case(lambda t, q, v, args, of=OF_CLASS: along(of.of_global()), set_global),
+    "a module that it imports": lambda: Case(importing, lambda x: setattr(SETTINGS, "k", x)),
     "a closure": of_a_closure,
     "a partial": of_a_partial,
     "a default": of_a_default,
@@ -133,6 +188,25 @@ def test_nothing_is_compiled_again_where_nothing_has_changed(case):
     for _ in range(3):
         end(system)
     assert program._jitted._cache_size() == count
+
+
+def test_a_name_that_stands_for_another_function_of_a_library():
+    system = ConstrainedSystem(lambda t, q, v, args: along(LAW(t)), circle)
+    before = end(system)
+    set_law(1.0)
+    try:
+        assert not np.array_equal(end(system), before)
+    finally:
+        set_law(9.81)
+
+
+def test_a_module_with_a_large_container_beside_what_changes():
+    module = types.ModuleType("tables")
+    module.many, module.k = [[float(k)] for k in range(100_000)], 9.81
+    system = ConstrainedSystem(lambda t, q, v, args: along(module.k + 0 * module.many[0][0]), circle)
+    before = end(system)
+    module.k = 1.0
+    assert not np.array_equal(end(system), before)
 
 
 def test_in_a_derivative_of_a_closure():
