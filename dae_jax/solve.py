@@ -62,7 +62,9 @@ def daesolve(
 
     **Arguments**
 
-    - `system`: the equations.
+    - `system`: the equations. What their functions take from around them (globals, closures, defaults, attributes, containers) is
+      looked at in each call, and a change is seen; only containers of more than 2,000 entries that are changed in place are not
+      looked into, nor objects of other libraries. Hand over as `args` what changes often: that compiles nothing anew.
     - `solver`: any diffrax solver, or one that keeps its steps on the constraints (`OrthogonalProjection`,
       `SymmetricProjection`, `TangentSpace`, `RATTLE`).
     - `t0`, `t1`, `dt0`: start, end and first (or fixed) step; t1 < t0 integrates backwards, with dt0 < 0.

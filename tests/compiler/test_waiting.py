@@ -1,7 +1,9 @@
 """What keeps the first answer from being waited for: what is compiled, by whom, and that it is said."""
 
 import dataclasses
+import gc
 import sys
+import threading
 from typing import ClassVar
 
 import diffrax
@@ -162,6 +164,43 @@ def test_inside_jit_there_is_no_time_to_tell():
     assert "compile_seconds" not in jax.jit(end)()
 
 
+class TestGarbage:
+    @pytest.fixture(autouse=True)
+    def _restored(self):
+        before = gc.get_threshold()
+        yield
+        gc.set_threshold(*before)
+
+    def test_is_looked_for_rarely_while_compiling(self):
+        seen = []
+        gc.set_threshold(700, 10, 10)
+        system = dae_jax.ConstrainedSystem(
+            lambda t, q, v, args: seen.append(gc.get_threshold()) or -q, SYSTEM.constraint
+        )
+        dae_jax.daesolve(system, diffrax.Euler(), 0.0, 0.1, 0.1, (jnp.array([1.0, 0.0]), jnp.zeros(2)))
+        assert waiting.RARELY in seen
+        assert gc.get_threshold() == (700, 10, 10)
+
+    def test_threads_put_back_what_was_there(self):
+        gc.set_threshold(700, 10, 10)
+        waiting.begin()
+        other = threading.Thread(target=waiting.begin)
+        other.start()
+        other.join()
+        waiting.end()
+        assert gc.get_threshold() == waiting.RARELY
+        waiting._of_thread.notice = waiting._Silent()  # as in the other thread
+        waiting.end()
+        assert gc.get_threshold() == (700, 10, 10)
+
+    def test_a_collector_that_is_off_stays_off(self):
+        gc.set_threshold(0)
+        waiting.begin()
+        assert gc.get_threshold()[0] == 0
+        waiting.end()
+        assert gc.get_threshold()[0] == 0
+
+
 @pytest.mark.parametrize(
     ("scene", "saveat"),
     [
@@ -211,7 +250,10 @@ def test_the_derivative_of_an_event_is_not_left_to_xla(kind, monkeypatch):
         return sol.ts[-1] + sol.ys[0][-1, 0]
 
     assert abs((jax.grad if kind == "event" else jax.jacfwd)(end)(9.81)) > 1e-3
-    assert {found.compiler for found in made_by} == {"llvm"}
+    # What is between the parts of a solve with a reset has LAPACK's eigenvalues in it.
+    left = {x.primitive for found in made_by for x in found.unsupported}
+    assert left <= ({"eigh"} if kind == "reset" else set())
+    assert "llvm" in {found.compiler for found in made_by}
 
 
 def test_passes_are_run_where_they_gain_more_than_they_take():
