@@ -18,7 +18,7 @@ import sysconfig
 import types
 from array import array
 from collections import deque
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -162,7 +162,7 @@ class _Look:
         for name in names:
             if name in there:
                 yield from self._named(name, there[name], names)
-            elif name in sys.modules:  # that the function imports, perhaps
+            elif name in sys.modules and not _is_installed(name):  # that the function imports, perhaps
                 yield from self._named(name, sys.modules[name], names)
 
     def _named(self, name: str, x: object, names: tuple[str, ...] = ()) -> Iterator[tuple[str, Hashable]]:
@@ -214,11 +214,11 @@ class _Look:
         if isinstance(x, staticmethod | classmethod):
             return self._counted(x.__func__)
         found: list[Hashable] = []
-        if isinstance(x, Mapping):
+        if isinstance(x, dict | types.MappingProxyType):
             found += [(Same(k) if k.__hash__ is None else k, self._counted(y)) for k, y in x.items()]
-        elif isinstance(x, Set):
+        elif isinstance(x, set | frozenset):
             found.append(frozenset(map(self._counted, x)))
-        elif isinstance(x, Sequence):
+        elif isinstance(x, list | tuple | deque | array):
             found += map(self._counted, x)
         of_library = _of_library(x) and not isinstance(x, eqx.Module)
         attributes = {} if of_library else _attributes(x)
