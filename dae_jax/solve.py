@@ -15,7 +15,7 @@ from .driver.doubts import warn
 from .driver.failures import OKAY, in_words, raised_in_the_program
 from .driver.options import refuse_misfits, refuse_no_event, refuse_other_steps, refuse_wrong_options
 from .driver.problem import Problem, Program, split
-from .driver.program import KEPT, Solve, run
+from .driver.program import KEPT, Solve, run, traces
 from .driver.resets import Reset, refuse_other_outputs
 from .driver.start import as_array, checked, refuse_bad_start, refuse_bad_times
 from .equations.residual_form import Form
@@ -31,7 +31,7 @@ from .solution import DAESolution
 from .solvers import AbstractResidualSolver, SelectedResiduals, SelectedStates, takes_residuals
 from .systems import System, is_mechanism
 from .types import Args, Controller, DType, ProgressMeter, Solver, State, Time
-from .validate.captured import current
+from .validate.captured import current, settle
 from .validate.states import with_rates
 from .validate.user_functions import not_finite, refuse_wrong_functions
 
@@ -64,7 +64,8 @@ def daesolve(
 
     - `system`: the equations. What their functions take from around them (globals, closures, defaults, attributes, containers) is
       looked at in each call, and a change is seen; only containers of more than 2,000 entries that are changed in place are not
-      looked into, nor objects of other libraries. Hand over as `args` what changes often: that compiles nothing anew.
+      looked into, nor objects of other libraries, nor objects in `args` that are no pytrees. Hand over as `args` what changes often,
+      as numbers and arrays: that compiles nothing anew.
     - `solver`: any diffrax solver, or one that keeps its steps on the constraints (`OrthogonalProjection`,
       `SymmetricProjection`, `TangentSpace`, `RATTLE`).
     - `t0`, `t1`, `dt0`: start, end and first (or fixed) step; t1 < t0 integrates backwards, with dt0 < 0.
@@ -93,10 +94,13 @@ def daesolve(
         max_steps, progress_meter,
     )  # fmt: skip
     program, arrays = split((solve, problem))
+    before = traces()
     if any(isinstance(x, Tracer) for x in arrays):
         sol, *_ = run(program, arrays)
     else:
         sol = _run_on_numbers(program, arrays, solve, problem)
+    if traces() != before:
+        settle(program.leaves)
     sol = _raise_if_failed(sol, problem) if throw else sol
     if not isinstance(sol.stats["doubts"], Tracer):
         warn(sol, stacklevel=2)

@@ -20,7 +20,7 @@ from ..formulations import AbstractFormulation
 from ..solution import DAESolution
 from ..solvers import AbstractManifoldSolver, economical, replays, takes_residuals
 from ..types import Scalar, State
-from ..validate.captured import settle
+from ..validate.captured import settled
 from ..validate.user_functions import refuse_wrong_functions, returned
 from .diffrax_call import Decode, View, call
 from .outcome import judged
@@ -33,6 +33,11 @@ from .trajectory_adjoint import Taped, can_be_taped, cotangents, recorded, saved
 # How many problems stay compiled. Each holds 8 MB and more, most of it in JAX's caches of what it has traced.
 KEPT = 128
 _traced: list[Program] = []
+
+
+def traces() -> int:
+    """How many problems have been traced since JAX was last told to forget some."""
+    return len(_traced)
 
 
 def _make_room() -> None:
@@ -48,8 +53,8 @@ def _jitted(program: Program, arrays: Arrays) -> Any:
     solve, problem = program.whole(jax.tree.map(jnp.asarray, arrays))
     waiting.begin(always=not isinstance(solve.progress_meter, diffrax.NoProgressMeter))
     solve.refuse_wrong_functions(problem)
-    sol, as_expected = solve_with_resets(solve, problem) if isinstance(solve.event, Reset) else solve(problem)
-    settle(program.leaves)
+    with settled(program.leaves):
+        sol, as_expected = solve_with_resets(solve, problem) if isinstance(solve.event, Reset) else solve(problem)
     return Split.of(sol), as_expected
 
 
@@ -57,9 +62,8 @@ def _jitted(program: Program, arrays: Arrays) -> Any:
 def _numbers(program: Program, arrays: Arrays) -> Split:
     """diffrax's part of a solve; jitted, so that derivatives and batches of it find it traced."""
     solve, problem = program.whole(arrays)
-    found = Split.of(call(solve, problem))
-    settle(program.leaves)
-    return found
+    with settled(program.leaves):
+        return Split.of(call(solve, problem))
 
 
 def run(program: Program, arrays: Arrays) -> tuple[DAESolution, Any, float]:
@@ -172,28 +176,28 @@ class Solve:
         program, _ = split((self, problem))
 
         def pull_back(inputs: tuple[Arrays], cotangent: Split) -> list[Any]:
-            (arrays,) = inputs
-            solve, problem = program.whole(arrays)
-            recording = dataclasses.replace(
-                solve._forwards(), saveat=recorded(solve.saveat, replays(solve.solver)), recording=True
-            )
-            record, also_arrays = recording.kernel(problem)
-            _, _, ts, ys, interpolation, *_ = record(also_arrays).numbers
-            numbers, others = eqx.partition(arrays, eqx.is_inexact_array)
-            fixed: list[Any] = []
+            with settled(program.leaves):
+                (arrays,) = inputs
+                solve, problem = program.whole(arrays)
+                recording = dataclasses.replace(
+                    solve._forwards(), saveat=recorded(solve.saveat, replays(solve.solver)), recording=True
+                )
+                record, also_arrays = recording.kernel(problem)
+                _, _, ts, ys, interpolation, *_ = record(also_arrays).numbers
+                numbers, others = eqx.partition(arrays, eqx.is_inexact_array)
+                fixed: list[Any] = []
 
-            def encoded(numbers: PyTree) -> Any:
-                solve, problem = program.whole(eqx.combine(numbers, others))
-                found, fixed[:] = eqx.partition(solve._taped(problem), eqx.is_inexact_array)
-                return found
+                def encoded(numbers: PyTree) -> Any:
+                    solve, problem = program.whole(eqx.combine(numbers, others))
+                    found, fixed[:] = eqx.partition(solve._taped(problem), eqx.is_inexact_array)
+                    return found
 
-            found, through_encoding = jax.vjp(encoded, numbers)
-            of_t0, of_t1, of_ts, of_ys, *_ = cotangent.numbers
-            fixed_steps = isinstance(self.controller, diffrax.ConstantStepSize)
-            tape = ts["tape"], ys["tape"], None if interpolation is None else interpolation.path.infos
-            of_taped = cotangents(eqx.combine(found, Taped(*fixed)), fixed_steps, tape, of_ys)
-            settle(program.leaves)
-            return inexact(through_encoding(saved_times(of_taped, self.saveat.subs, of_t0, of_t1, of_ts))[0])
+                found, through_encoding = jax.vjp(encoded, numbers)
+                of_t0, of_t1, of_ts, of_ys, *_ = cotangent.numbers
+                fixed_steps = isinstance(self.controller, diffrax.ConstantStepSize)
+                tape = ts["tape"], ys["tape"], None if interpolation is None else interpolation.path.infos
+                of_taped = cotangents(eqx.combine(found, Taped(*fixed)), fixed_steps, tape, of_ys)
+                return inexact(through_encoding(saved_times(of_taped, self.saveat.subs, of_t0, of_t1, of_ts))[0])
 
         return pull_back
 

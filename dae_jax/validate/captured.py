@@ -11,6 +11,8 @@ arrays, containers, functions, classes and attributes of objects are that it fin
 modules it names, and the object that it is a method of.
 """
 
+import contextlib
+import dataclasses
 import functools
 import hashlib
 import sys
@@ -46,12 +48,12 @@ _before: dict["Captured", "Captured"] = {}
 
 def current(tree: T) -> T:
     """The tree with its functions as they are with the values of now."""
-    return jax.tree.map(_current, tree)
+    return jax.tree.map(_current, tree, is_leaf=_is_function_with_leaves)
 
 
 def settle(leaves: Iterable[object]) -> None:
-    """To be called when functions have been traced: what they have changed themselves, such as a counter of their calls, makes no
-    other functions of them.
+    """To be called when functions have been traced: what they have changed themselves meanwhile, such as a counter of their calls,
+    makes no other functions of them.
     """
     for x in leaves:
         if isinstance(x, Captured):
@@ -60,6 +62,16 @@ def settle(leaves: Iterable[object]) -> None:
                 _before[now] = x
     for oldest in list(_before)[:-REMEMBERED]:
         _before.pop(oldest, None)
+
+
+@contextlib.contextmanager
+def settled(leaves: Iterable[object]) -> Iterator[None]:
+    """The same around tracing that may come long after the functions were looked at, as that of a derivative does: what has changed
+    in between makes others of them.
+    """
+    untouched = [x for x in leaves if isinstance(x, Captured) and _current(x.__wrapped__) == x]
+    yield
+    settle(untouched)
 
 
 class Captured:
@@ -84,6 +96,23 @@ class Captured:
         return repr(self.__wrapped__)
 
 
+@functools.partial(jax.tree_util.register_dataclass, data_fields=("fn",), meta_fields=("values",))
+@dataclasses.dataclass(frozen=True)
+class CapturedModule:
+    """A module that is called, with arrays of its own, and what its class takes from around it."""
+
+    fn: Any
+    values: Hashable
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        return self.fn(*args, **kwargs)
+
+    @property
+    def __wrapped__(self) -> Callable[..., Any]:
+        """What `inspect.signature` reads."""
+        return self.fn
+
+
 class Same:
     """An object that is equal to itself alone."""
 
@@ -103,8 +132,14 @@ def values_of(fn: types.FunctionType, others: tuple[object, ...]) -> Hashable:
     return tuple(look.globals(fn)), tuple(map(look.value, others))
 
 
+def _is_function_with_leaves(x: object) -> bool:
+    return isinstance(x, eqx.Module) and callable(x) and not _is_installed(type(x).__module__)
+
+
 def _current(x: Any) -> Any:
-    if not callable(x) or isinstance(x, Captured | type) or _of_library(x):
+    if _is_function_with_leaves(x):
+        return CapturedModule(x, _Look().value(type(x)))
+    if not callable(x) or isinstance(x, Captured | CapturedModule | type) or _of_library(x):
         return x
     values = _Look().of_callable(x)
     if not values:
@@ -182,7 +217,8 @@ class _Look:
         if isinstance(x, float):
             return float, x.hex()
         if isinstance(x, np.ndarray | np.generic):
-            return _of_numbers(np.asarray(x))
+            x = np.asarray(x)
+            return _of_numbers(x) if x.dtype != object else (x.shape, self.value(tuple(x.ravel())))
         if isinstance(x, jax.Array | types.ModuleType):
             return Same(x)
         if isinstance(x, type):
@@ -264,8 +300,6 @@ def _is_installed(module: str) -> bool:
 
 
 def _of_numbers(x: np.ndarray) -> Hashable:
-    if x.dtype == object:
-        return Same(x)
     bits = x.tobytes()
     return x.shape, x.dtype.str, bits if len(bits) <= 64 else hashlib.blake2b(bits).digest()
 

@@ -280,6 +280,53 @@ class TestCounters:
         assert not np.array_equal(end(system, args=fn), before)
 
 
+def test_what_changes_before_a_derivative_is_traced_is_a_change():
+    table = {"k": 1.0}
+    system = ConstrainedSystem(lambda t, q, v, args: jnp.array([-table["k"] * q[0], 0.0]), lambda t, q, args: q[1])
+
+    def position(x):
+        return dae_jax.daesolve(system, SOLVER, 0.0, 1.0, None, (jnp.array([x, 0.0]), jnp.zeros(2))).ys[0][0, 0]
+
+    _, pull = jax.vjp(position, 1.0)
+    table["k"] = 4.0
+    assert pull(1.0)[0] == pytest.approx(np.cos(1))
+    assert position(1.0) == pytest.approx(np.cos(2))
+    assert jax.grad(position)(1.0) == pytest.approx(np.cos(2))
+
+
+class Module(eqx.Module):
+    scale: jax.Array
+
+    def __call__(self, t, q, v, args):
+        return along(self.scale * K)
+
+
+@pytest.mark.parametrize("where", ["the class of a module", "an array of objects", "a dictionary's attribute"])
+def test_in_other_places(where):
+    objects, own = np.array([9.81], object), type("Own", (dict,), {})()
+    own.k = 9.81
+    force, args, change = {
+        "the class of a module": (Module(jnp.ones(())), None, set_global),
+        "an array of objects": (lambda t, q, v, args: along(objects[0]), None, lambda x: objects.fill(x)),
+        "a dictionary's attribute": (lambda t, q, v, args: along(own.k), None, lambda x: setattr(own, "k", x)),
+    }[where]  # fmt: skip
+    system = ConstrainedSystem(force, circle)
+    try:
+        before = end(system, args=args)
+        assert np.array_equal(end(system, args=args), before)
+        change(1.0)
+        assert np.array_equal(end(system, args=args), end(ConstrainedSystem(lambda t, q, v, args: along(1.0), circle)))
+    finally:
+        change(9.81)
+
+
+def test_a_module_keeps_its_derivatives():
+    loss = lambda scale: end(ConstrainedSystem(Module(scale), circle))[0]
+    step = 1e-5
+    expected = (loss(jnp.asarray(1 + step)) - loss(jnp.asarray(1 - step))) / (2 * step)
+    assert float(jax.grad(loss)(jnp.ones(()))) == pytest.approx(float(expected), rel=1e-4)
+
+
 class TestElsewhere:
     """In everything that keeps what it has compiled."""
 
