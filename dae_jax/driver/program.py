@@ -109,7 +109,7 @@ class Solve:
         backwards = problem.t1 < problem.t0
         self = dataclasses.replace(self, formulation=self.formulation.towards(jnp.where(backwards, -1, 1)))
         numbers, arrays = self.kernel(problem)
-        forward, _ = self._forwards().kernel(problem)
+        forward, _ = self.forwards().kernel(problem)
         pull_back = self._pull_back(problem)
         *fields, end = one_kernel(numbers, self.derivative(), pull_back, forward)(arrays).whole()
         check, check_arrays = self._check(problem, end)
@@ -180,7 +180,7 @@ class Solve:
                 (arrays,) = inputs
                 solve, problem = program.whole(arrays)
                 recording = dataclasses.replace(
-                    solve._forwards(), saveat=recorded(solve.saveat, replays(solve.solver)), recording=True
+                    solve.forwards(), saveat=recorded(solve.saveat, replays(solve.solver)), recording=True
                 )
                 record, also_arrays = recording.kernel(problem)
                 _, _, ts, ys, interpolation, *_ = record(also_arrays).numbers
@@ -208,7 +208,7 @@ class Solve:
         view = View(part.fn, Decode(self.formulation, self.solver), problem.args)
         return Taped(self.formulation, solver, part, problem.t0, problem.t1, y, ode, view)
 
-    def _forwards(self) -> "Solve":
+    def forwards(self) -> "Solve":
         """The same solve with forward derivatives."""
         return dataclasses.replace(self, adjoint=diffrax.ForwardMode())
 

@@ -172,7 +172,7 @@ def solve_with_resets(solve: "Solve", problem: Problem) -> tuple[DAESolution, An
         program, arrays = split((solve, problem))
         return lambda arrays: Split.of(_part_by_part(*program.whole(arrays))), arrays
 
-    forward, _ = parts(dataclasses.replace(solve, adjoint=diffrax.ForwardMode()))
+    forward, _ = parts(solve.forwards())
     numbers, arrays = parts(solve)
     return one_kernel(numbers, solve.derivative(), None, forward)(arrays).whole()
 
