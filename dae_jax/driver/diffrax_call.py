@@ -24,10 +24,11 @@ from ..solvers import (
     takes_residuals,
 )
 from ..types import Args, BoolLike, Time, Y
+from .passages import passages, watched
 from .problem import Problem
 from .start import is_saved_part
+from .summed_errors import SummedErrors
 from .trajectory_adjoint import as_it_is, can_be_taped
-from .watched_steps import WatchedSteps
 
 
 if TYPE_CHECKING:
@@ -86,9 +87,14 @@ def call(solve: "Solve", problem: Problem) -> tuple[Any, ...]:
         ),
     )
     saveat = dataclasses.replace(saveat, solver_state=True) if counts(solver) else saveat
-    watched = isinstance(controller, diffrax.ConstantStepSize) and not solve.recording
-    if watched:
-        controller, saveat = WatchedSteps(controller), dataclasses.replace(saveat, controller_state=True)
+    sums_errors = isinstance(controller, diffrax.ConstantStepSize) and not solve.recording
+    controller, passage = (
+        SummedErrors(controller) if sums_errors else controller,
+        passages(problem, solve.formulation.decode),
+    )
+    controller = controller if passage is None else watched(controller, passage)
+    if sums_errors or passage is not None:
+        saveat = dataclasses.replace(saveat, controller_state=True)
     sol = diffrax.diffeqsolve(
         solve.formulation.term(),
         _for_derivative(solve, solver, y),
@@ -106,8 +112,10 @@ def call(solve: "Solve", problem: Problem) -> tuple[Any, ...]:
     starts = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(y)]))
     result = RESULTS.where(starts, RESULTS.promote(sol.result), RESULTS.no_finite_start)
     stats.update((name, getattr(sol.solver_state, name)) for name in counts(solver))
-    errors = lax.stop_gradient(cast(Any, sol.controller_state)[-1]) if watched else None
-    return sol.t0, sol.t1, ts["user"], ys["user"], interpolation, stats, result, sol.event_mask, errors, end
+    state = lax.stop_gradient(cast(Any, sol.controller_state))
+    state, passed = (state, False) if passage is None else (state.steps, state.passed)
+    seen = state[-1] if sums_errors else None, passed
+    return sol.t0, sol.t1, ts["user"], ys["user"], interpolation, stats, result, sol.event_mask, seen, end
 
 
 def _for_derivative(solve: "Solve", solver: diffrax.AbstractSolver, y: Y) -> Any:

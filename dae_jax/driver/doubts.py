@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from ..solution import AccuracyWarning, DAESolution
-from ..types import BoolScalar, IntScalar, Scalar
+from ..types import BoolLike, BoolScalar, IntScalar, Scalar
 
 
 if TYPE_CHECKING:
@@ -26,6 +26,7 @@ class Doubt(enum.IntFlag):
     DRIFTED = 1
     UNRESOLVED = 2
     MANY_STEPS = 4
+    PASSED = 8
 
 
 _SENTENCES = {
@@ -42,17 +43,26 @@ _SENTENCES = {
         "A million steps and more were taken, and the errors that the tolerance allows in each of them may add up to more than a "
         "hundredth of the solution. Use a smaller tolerance or a method of higher order, and compare."
     ),
+    Doubt.PASSED: (
+        "A step has passed a configuration in which the constraints depend on each other, such as a dead centre, or was so long that "
+        "they turned by more than a right angle. There the motion may go on in more than one way, or turn a corner that the step does "
+        "not see: the solution is one of these. Look whether it is the one that is meant, and take smaller steps where they are fixed."
+    ),
 }
 
 
-def found(solve: "Solve", drifted: BoolScalar, steps: IntScalar, errors: Scalar | None) -> Int[Array, ""]:
-    """The doubts about a solve that went well, as bits; `errors`: of all fixed steps, as parts of the solution."""
+def found(
+    solve: "Solve", drifted: BoolScalar, steps: IntScalar, errors: Scalar | None, passed: BoolLike
+) -> Int[Array, ""]:
+    """The doubts about a solve that went well, as bits; `errors`: of all fixed steps, as parts of the solution; `passed`:
+    a configuration in which the constraints depend on each other.
+    """
     many = jnp.asarray(False)
     if isinstance(solve.controller, diffrax.AbstractAdaptiveStepSizeController):
         rtol = jnp.max(jnp.asarray(getattr(solve.controller, "rtol")))  # noqa: B009
         many = (steps >= MANY) & (steps * rtol > PART)
     unresolved = jnp.asarray(False) if errors is None else errors > 1
-    bits = {Doubt.DRIFTED: drifted, Doubt.UNRESOLVED: unresolved, Doubt.MANY_STEPS: many}
+    bits = {Doubt.DRIFTED: drifted, Doubt.UNRESOLVED: unresolved, Doubt.MANY_STEPS: many, Doubt.PASSED: passed}
     return sum((jnp.where(on, int(bit), 0) for bit, on in bits.items()), jnp.zeros((), int))
 
 

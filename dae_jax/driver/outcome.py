@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 def judged(solve: "Solve", out: Sequence[PyTree], problem: Problem, found: tuple[PyTree, ...]) -> DAESolution:
     """The solution, with the code of what is wrong with it; `found`: what a look at its start and its end has shown."""
-    t0, t1, ts, ys, interpolation, stats, code, event_mask, errors = out
+    t0, t1, ts, ys, interpolation, stats, code, event_mask, (errors, passed) = out
     (start, _), end, (finite_end, defined) = found
     failed = lambda name, instead, when=True: RESULTS.where((code == name) & when, instead, code)
     if takes_residuals(solve.solver):
@@ -54,7 +54,9 @@ def judged(solve: "Solve", out: Sequence[PyTree], problem: Problem, found: tuple
     went_well = (code == RESULTS.successful) | (code == RESULTS.event_occurred)
     stats = {
         **stats,
-        "doubts": jnp.where(went_well, doubts.found(solve, end.drifted, stats["num_accepted_steps"], errors), 0),
+        "doubts": jnp.where(
+            went_well, doubts.found(solve, end.drifted, stats["num_accepted_steps"], errors, passed), 0
+        ),
     }
     return DAESolution(t0, t1, ts, ys, interpolation, stats, code, event_mask, problem.args, rank, precision)
 

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..linalg import smallest_pivot
+from ..linalg import minor_sign, row_products, smallest_pivot
 from ..types import IntScalar, Phase, Time
-from .constraint_jacobian import Rank, SparseNormals, matvec
+from .constraint_jacobian import Rank, SparseNormals, mass_solve, matvec, unit_diagonal
 from .mechanical import MechanicalODE, allowed_contradiction
 
 
@@ -199,6 +199,17 @@ def has_rank(ode: MechanicalODE, t: Time, y: Phase, rank: Rank | None) -> tuple[
     consistent = found.contradiction <= allowed_contradiction(y[0].dtype)
     fits = (found.holonomic == rank[0]) & (found.all == rank[1]) & found.agree & consistent
     return fits, fits
+
+
+def turned_over(ode: MechanicalODE, t0: Time, y0: Phase, t1: Time, y1: Phase) -> Bool[Array, ""]:
+    """Whether det(G₁ M₀⁻¹ G₀ᵀ) < 0: between two flat states, the ends of a step, the gradients of the holonomic constraints (of as
+    many as are independent) have passed a configuration in which they depend on each other, or turned by over a right angle.
+    """
+    g0, g1 = (jax.jacfwd(ode.constraint, 1)(t, q) for t, (q, _) in ((t0, y0), (t1, y1)))
+    weighted = mass_solve(ode.mass(y0[0]), g0.T).T
+    scale = unit_diagonal(row_products(g0, weighted))
+    rank = len(g0) if ode.rank is None else ode.rank[0]
+    return minor_sign(jax.lax.stop_gradient(row_products(g1, weighted) * scale[:, None] * scale), rank) < 0
 
 
 def is_near_constraints(

@@ -1,6 +1,11 @@
 """Linear and nonlinear equations of a few unknowns, solved in plain arithmetic; LAPACK above a measured size."""
 
-from .dense import determinant_sign as determinant_sign, row_products as row_products, solve as solve
+from .dense import (
+    determinant_sign as determinant_sign,
+    minor_sign as minor_sign,
+    row_products as row_products,
+    solve as solve,
+)
 from .elimination import Elimination as Elimination, elimination as elimination, take as take
 from .lineax_solvers import SmallCholesky as SmallCholesky, SmallLU as SmallLU
 from .newton import (

@@ -11,15 +11,15 @@ from jaxtyping import PyTree
 from ..types import Scalar
 
 
-class WatchedSteps(diffrax.AbstractStepSizeController):
+class SummedErrors(diffrax.AbstractStepSizeController):
     """The steps of another controller, and the sum of their errors: each the largest of any part of the state, relative to the
     largest that this part has been. It is the last of the controller's state.
     """
 
     steps: diffrax.AbstractStepSizeController
 
-    def wrap(self, direction: Any) -> "WatchedSteps":
-        return WatchedSteps(self.steps.wrap(direction))
+    def wrap(self, direction: Any) -> "SummedErrors":
+        return SummedErrors(self.steps.wrap(direction))
 
     def init(
         self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, error_order: Any

@@ -1,0 +1,128 @@
+"""Steps that pass a configuration in which the constraints depend on each other, such as a dead centre, or leap over one."""
+
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from ..equations.manifold_ode import Equations
+from ..equations.mechanical import MechanicalODE
+from ..equations.regularity import turned_over
+from ..systems import is_mechanism
+from ..types import BoolScalar, Scalar, Time, Y
+from .problem import Problem
+
+
+# A step that passes such a configuration is tried again with a part of its length, down to so small a part of the solve: near it
+# the motion may turn a corner that a longer step does not see.
+SHORTER, SHORTEST = 0.25, 1e-9
+# With more constraints a determinant takes longer than a step.
+MOST = 32
+
+
+class Passage(eqx.Module):
+    """Whether a step from (t₀, y₀) to (t₁, y₁) passes a configuration in which the constraints depend on each other."""
+
+    ode: MechanicalODE
+    decode: Callable[..., Any]
+
+    def __call__(self, t0: Time, y0: Y, t1: Time, y1: Y, equations: Equations) -> Bool[Array, ""]:
+        at = lambda t, y: self.ode.encode(self.decode(t, y, equations))
+        return turned_over(self.ode, t0, at(t0, y0), t1, at(t1, y1))
+
+
+def passages(problem: Problem, decode: Callable[..., Any]) -> Passage | None:
+    """What sees passages in the solution of a problem: of a mechanism with few constraints."""
+    system, t, state, args = problem.start
+    if not is_mechanism(system):
+        return None
+    ode = MechanicalODE.of(system, t, state, args, problem.rank)
+    return Passage(ode, decode) if 0 < ode.holonomic <= MOST else None
+
+
+def watched(controller: diffrax.AbstractStepSizeController, passage: Passage) -> "_AbstractWatchedSteps":
+    """The controller with an eye on passages."""
+    adapts = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
+    return (WatchedAdaptiveSteps if adapts else WatchedSteps)(controller, passage)
+
+
+class _Watched(NamedTuple):
+    """The controller's state, the shortest step that is tried again, and whether one has passed such a configuration."""
+
+    steps: Any
+    shortest: Scalar
+    passed: BoolScalar
+
+
+class _AbstractWatchedSteps(diffrax.AbstractStepSizeController):
+    """The steps of another controller."""
+
+    steps: eqx.AbstractVar[Any]
+    passage: eqx.AbstractVar[Passage]
+    direction: eqx.AbstractVar[Any]
+    shortest: eqx.AbstractClassVar[float]
+
+    def wrap(self, direction: Any) -> Any:
+        return type(self)(self.steps.wrap(direction), self.passage, direction)
+
+    def init(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, error_order: Any
+    ) -> tuple[Any, _Watched]:
+        first, state = self.steps.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        return first, _Watched(state, self.shortest * jnp.abs(t1 - t0), jnp.asarray(False))
+
+    def adapt_step_size(
+        self,
+        t0: Any,
+        t1: Any,
+        y0: Any,
+        y1_candidate: Any,
+        args: Any,
+        y_error: Any,
+        error_order: Any,
+        controller_state: _Watched,
+    ) -> Any:
+        before, shortest, passed = controller_state
+        keep, next_t0, next_t1, made_jump, after, result = self.steps.adapt_step_size(
+            t0, t1, y0, y1_candidate, args, y_error, error_order, before
+        )
+        passes = keep & self.passage(self.direction * t0, y0, self.direction * t1, y1_candidate, args)
+        again = passes & (t1 - t0 > shortest)
+        next_t0 = jnp.where(again, t0, next_t0)
+        next_t1 = jnp.where(again, t0 + SHORTER * (t1 - t0), next_t1)
+        after = jax.tree.map(lambda old, new: jnp.where(again, old, new), before, after)
+        return keep & ~again, next_t0, next_t1, made_jump, _Watched(after, shortest, passed | (passes & ~again)), result
+
+
+class WatchedSteps(_AbstractWatchedSteps):
+    """Steps that are not chosen: none is tried again."""
+
+    steps: Any
+    passage: Passage
+    direction: Any = 1
+    shortest: ClassVar[float] = jnp.inf
+
+
+class WatchedAdaptiveSteps(_AbstractWatchedSteps, diffrax.AbstractAdaptiveStepSizeController):
+    """Steps of a controller with tolerances."""
+
+    steps: Any
+    passage: Passage
+    direction: Any = 1
+    shortest: ClassVar[float] = SHORTEST
+
+    @property
+    def rtol(self) -> Any:
+        return self.steps.rtol
+
+    @property
+    def atol(self) -> Any:
+        return self.steps.atol
+
+    @property
+    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return self.steps.norm
