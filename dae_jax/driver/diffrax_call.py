@@ -90,7 +90,7 @@ def call(solve: "Solve", problem: Problem) -> tuple[Any, ...]:
     sums_errors = isinstance(controller, diffrax.ConstantStepSize) and not solve.recording
     controller, passage = (
         SummedErrors(controller) if sums_errors else controller,
-        passages(problem, solve.formulation.decode),
+        passages(problem, solve.formulation.decode, not solve.keeps()[0]),
     )
     controller = controller if passage is None else watched(controller, passage)
     if sums_errors or passage is not None:

@@ -7,11 +7,10 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
 
 from ..equations.manifold_ode import Equations
 from ..equations.mechanical import MechanicalODE
-from ..equations.regularity import turned_over
+from ..equations.regularity import drifted_over, turned_over
 from ..systems import is_mechanism
 from ..types import BoolScalar, Scalar, Time, Y
 from .problem import Problem
@@ -25,23 +24,28 @@ MOST = 32
 
 
 class Passage(eqx.Module):
-    """Whether a step from (t₀, y₀) to (t₁, y₁) passes a configuration in which the constraints depend on each other."""
+    """Whether a step from (t₀, y₀) to (t₁, y₁) passes a configuration in which the constraints depend on each other; and, of a method
+    that `drifts`, whether the way back to the constraints may pass one, which no shorter step changes.
+    """
 
     ode: MechanicalODE
     decode: Callable[..., Any]
+    drifts: bool = eqx.field(static=True)
 
-    def __call__(self, t0: Time, y0: Y, t1: Time, y1: Y, equations: Equations) -> Bool[Array, ""]:
+    def __call__(self, t0: Time, y0: Y, t1: Time, y1: Y, equations: Equations) -> tuple[BoolScalar, BoolScalar]:
         at = lambda t, y: self.ode.encode(self.decode(t, y, equations))
-        return turned_over(self.ode, t0, at(t0, y0), t1, at(t1, y1))
+        start, end = at(t0, y0), at(t1, y1)
+        drifted = drifted_over(self.ode, t1, end) if self.drifts else jnp.asarray(False)
+        return turned_over(self.ode, t0, start, t1, end), drifted
 
 
-def passages(problem: Problem, decode: Callable[..., Any]) -> Passage | None:
+def passages(problem: Problem, decode: Callable[..., Any], drifts: bool) -> Passage | None:
     """What sees passages in the solution of a problem: of a mechanism with few constraints."""
     system, t, state, args = problem.start
     if not is_mechanism(system):
         return None
     ode = MechanicalODE.of(system, t, state, args, problem.rank)
-    return Passage(ode, decode) if 0 < ode.holonomic <= MOST else None
+    return Passage(ode, decode, drifts) if 0 < ode.holonomic <= MOST else None
 
 
 def watched(controller: diffrax.AbstractStepSizeController, passage: Passage) -> "_AbstractWatchedSteps":
@@ -90,12 +94,13 @@ class _AbstractWatchedSteps(diffrax.AbstractStepSizeController):
         keep, next_t0, next_t1, made_jump, after, result = self.steps.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, before
         )
-        passes = keep & self.passage(self.direction * t0, y0, self.direction * t1, y1_candidate, args)
-        again = passes & (t1 - t0 > shortest)
+        passes, drifted = self.passage(self.direction * t0, y0, self.direction * t1, y1_candidate, args)
+        again = keep & passes & (t1 - t0 > shortest)
+        passed = passed | (keep & ~again & (passes | drifted))
         next_t0 = jnp.where(again, t0, next_t0)
         next_t1 = jnp.where(again, t0 + SHORTER * (t1 - t0), next_t1)
         after = jax.tree.map(lambda old, new: jnp.where(again, old, new), before, after)
-        return keep & ~again, next_t0, next_t1, made_jump, _Watched(after, shortest, passed | (passes & ~again)), result
+        return keep & ~again, next_t0, next_t1, made_jump, _Watched(after, shortest, passed), result
 
 
 class WatchedSteps(_AbstractWatchedSteps):

@@ -118,6 +118,10 @@ class Solve:
         (_, as_expected), *_ = found
         return judged(self, fields, problem, found), as_expected
 
+    def keeps(self) -> tuple[bool, bool]:
+        """Whether g and (ġ, h) hold at each step."""
+        return (True, True) if isinstance(self.solver, AbstractManifoldSolver) else self.formulation.keeps
+
     def refuse_wrong_functions(self, problem: Problem) -> None:
         """Refuses functions of the user that do not take or return what they must, and a system that the method is not for,
         in a sentence.
@@ -133,10 +137,9 @@ class Solve:
 
     def _check(self, problem: Problem, end: tuple[Scalar, State]) -> tuple[Callable[..., Any], list[Any]]:
         """What is wrong with the start and the end, as a function of arrays, and its arrays."""
-        manifold, residual = isinstance(self.solver, AbstractManifoldSolver), takes_residuals(self.solver)
+        residual = takes_residuals(self.solver)
         # Points between the steps of a solver of residuals are off by what its dense output is.
-        keeps = self.formulation.keeps if not residual or self.event is None else (False, False)
-        keeps = (True, True) if manifold else keeps
+        keeps = (False, False) if residual and self.event is not None else self.keeps()
         if isinstance(self.controller, diffrax.AbstractAdaptiveStepSizeController):
             tolerances = tuple(jnp.max(jnp.asarray(getattr(self.controller, name))) for name in ("rtol", "atol"))
         else:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..linalg import minor_sign, row_products, smallest_pivot
+from ..linalg import minor_sign, row_products, semidefinite_solve, smallest_pivot
 from ..types import IntScalar, Phase, Time
 from .constraint_jacobian import Rank, SparseNormals, mass_solve, matvec, unit_diagonal
 from .mechanical import MechanicalODE, allowed_contradiction
@@ -20,6 +20,8 @@ LARGE = 0.25
 # not to be trusted.
 LEFT = 100
 DRIFTED = 1000
+# The change of the constraints' gradients on the way back from a drift that is suspicious, as one part in so many of them.
+FAR = 20
 # Tolerances that stand in for those of fixed steps.
 COARSE = 1e-3
 
@@ -205,11 +207,37 @@ def turned_over(ode: MechanicalODE, t0: Time, y0: Phase, t1: Time, y1: Phase) ->
     """Whether det(G₁ M₀⁻¹ G₀ᵀ) < 0: between two flat states, the ends of a step, the gradients of the holonomic constraints (of as
     many as are independent) have passed a configuration in which they depend on each other, or turned by over a right angle.
     """
-    g0, g1 = (jax.jacfwd(ode.constraint, 1)(t, q) for t, (q, _) in ((t0, y0), (t1, y1)))
-    weighted = mass_solve(ode.mass(y0[0]), g0.T).T
-    scale = unit_diagonal(row_products(g0, weighted))
-    rank = len(g0) if ode.rank is None else ode.rank[0]
-    return minor_sign(jax.lax.stop_gradient(row_products(g1, weighted) * scale[:, None] * scale), rank) < 0
+    _, lifted, scale = _holonomic_gram(ode, t0, y0)
+    return _is_turned(ode, row_products(_gradients(ode, t1, y1), lifted), scale)
+
+
+def drifted_over(ode: MechanicalODE, t: Time, y: Phase) -> Bool[Array, ""]:
+    """Whether the gradients G at a flat state and G′ at the nearest one on the constraints, q − M⁻¹Gᵀ(G M⁻¹Gᵀ)⁻¹g to first order,
+    are as different as if a configuration in which they depend on each other were near: det(G M⁻¹Gᵀ + c (G′ − G) M⁻¹Gᵀ) < 0 for a
+    large c, of either sign. The drift may then have led to another branch of the motion.
+    """
+    gram, lifted, scale = _holonomic_gram(ode, t, y)
+    rank = None if ode.rank is None else ode.rank[0]
+    multipliers = scale * semidefinite_solve(gram * scale[:, None] * scale, scale * ode.constraint(t, y[0]), rank)
+    change = row_products(_gradients(ode, t, (y[0] - matvec(lifted.T, multipliers), y[1])), lifted) - gram
+    return _is_turned(ode, gram + FAR * change, scale) | _is_turned(ode, gram - FAR * change, scale)
+
+
+def _gradients(ode: MechanicalODE, t: Time, y: Phase) -> Float[Array, "m n"]:
+    return jax.jacfwd(ode.constraint, 1)(t, y[0])
+
+
+def _holonomic_gram(ode: MechanicalODE, t: Time, y: Phase) -> tuple[Array, Array, Array]:
+    """G M⁻¹Gᵀ, G M⁻¹, and what makes the diagonal of the first 1."""
+    g = _gradients(ode, t, y)
+    lifted = mass_solve(ode.mass(y[0]), g.T).T
+    gram = row_products(g, lifted)
+    return gram, lifted, unit_diagonal(gram)
+
+
+def _is_turned(ode: MechanicalODE, product: Float[Array, "m m"], scale: Float[Array, " m"]) -> Bool[Array, ""]:
+    rank = len(product) if ode.rank is None else ode.rank[0]
+    return minor_sign(jax.lax.stop_gradient(product * scale[:, None] * scale), rank) < 0
 
 
 def is_near_constraints(
