@@ -121,7 +121,7 @@ class DAESolution(eqx.Module):
     - `stats`: counts of steps; `stats["end_time"]`: the time at which the solve ended; of a solve outside `jit`, `vmap` and
       `grad` also "compile_seconds", the time that it took to trace and compile it and to run it for the first time, 0 where it
       was compiled already; `stats["doubts"]`: 0, or what an `AccuracyWarning` says, as the sum of 1 (drifted), 2 (fixed steps too
-      large) and 4 (very many steps).
+      large), 4 (very many steps) and 8 (a singular configuration was passed).
     - `result`: a `RESULTS` code, with its message.
     - `event_mask`: which event ended the solve, if any.
     - `rank`: how many constraints are independent, where some are redundant, else `None`.

@@ -44,9 +44,10 @@ _SENTENCES = {
         "hundredth of the solution. Use a smaller tolerance or a method of higher order, and compare."
     ),
     Doubt.PASSED: (
-        "A step has passed a configuration in which the constraints depend on each other, such as a dead centre, or was so long that "
-        "they turned by more than a right angle. There the motion may go on in more than one way, or turn a corner that the step does "
-        "not see: the solution is one of these. Look whether it is the one that is meant, and take smaller steps where they are fixed."
+        "On its way the solution has passed a configuration in which the constraints depend on each other, such as a dead centre, or "
+        "has drifted so far that it may be on the wrong side of one: there the motion may go on in another way. (Steps in which the "
+        "constraints turn by more than a right angle are taken for such a passage too.) Look whether it goes on as is meant; a method "
+        "that keeps the constraints and smaller tolerances or steps tell what comes near one from what passes it."
     ),
 }
 

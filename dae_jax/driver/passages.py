@@ -1,42 +1,41 @@
-"""Steps that pass a configuration in which the constraints depend on each other, such as a dead centre, or leap over one."""
+"""Steps that pass a configuration in which the constraints depend on each other, such as a dead centre, or leap over one.
+
+They are not tried again with a smaller step: what really passes such a point, a parallelogram say, can only leap.
+"""
 
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 
 from ..equations.manifold_ode import Equations
 from ..equations.mechanical import MechanicalODE
 from ..equations.regularity import drifted_over, turned_over
 from ..systems import is_mechanism
-from ..types import BoolScalar, Scalar, Time, Y
+from ..types import BoolScalar, Time, Y
 from .problem import Problem
 
 
-# A step that passes such a configuration is tried again with a part of its length, down to so small a part of the solve: near it
-# the motion may turn a corner that a longer step does not see.
-SHORTER, SHORTEST = 0.25, 1e-9
 # With more constraints a determinant takes longer than a step.
 MOST = 32
 
 
 class Passage(eqx.Module):
     """Whether a step from (t₀, y₀) to (t₁, y₁) passes a configuration in which the constraints depend on each other; and, of a method
-    that `drifts`, whether the way back to the constraints may pass one, which no shorter step changes.
+    that `drifts`, whether the way back to the constraints may pass one.
     """
 
     ode: MechanicalODE
     decode: Callable[..., Any]
     drifts: bool = eqx.field(static=True)
 
-    def __call__(self, t0: Time, y0: Y, t1: Time, y1: Y, equations: Equations) -> tuple[BoolScalar, BoolScalar]:
+    def __call__(self, t0: Time, y0: Y, t1: Time, y1: Y, equations: Equations) -> BoolScalar:
         at = lambda t, y: self.ode.encode(self.decode(t, y, equations))
         start, end = at(t0, y0), at(t1, y1)
-        drifted = drifted_over(self.ode, t1, end) if self.drifts else jnp.asarray(False)
-        return turned_over(self.ode, t0, start, t1, end), drifted
+        passes = turned_over(self.ode, t0, start, t1, end)
+        return passes | drifted_over(self.ode, t1, end) if self.drifts else passes
 
 
 def passages(problem: Problem, decode: Callable[..., Any], drifts: bool) -> Passage | None:
@@ -51,14 +50,14 @@ def passages(problem: Problem, decode: Callable[..., Any], drifts: bool) -> Pass
 def watched(controller: diffrax.AbstractStepSizeController, passage: Passage) -> "_AbstractWatchedSteps":
     """The controller with an eye on passages."""
     adapts = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
-    return (WatchedAdaptiveSteps if adapts else WatchedSteps)(controller, passage)
+    watched_steps: Any = WatchedAdaptiveSteps if adapts else WatchedSteps
+    return watched_steps(controller, passage)
 
 
 class _Watched(NamedTuple):
-    """The controller's state, the shortest step that is tried again, and whether one has passed such a configuration."""
+    """The controller's state, and whether a step has passed such a configuration."""
 
     steps: Any
-    shortest: Scalar
     passed: BoolScalar
 
 
@@ -68,7 +67,6 @@ class _AbstractWatchedSteps(diffrax.AbstractStepSizeController):
     steps: eqx.AbstractVar[Any]
     passage: eqx.AbstractVar[Passage]
     direction: eqx.AbstractVar[Any]
-    shortest: eqx.AbstractClassVar[float]
 
     def wrap(self, direction: Any) -> Any:
         return type(self)(self.steps.wrap(direction), self.passage, direction)
@@ -77,7 +75,7 @@ class _AbstractWatchedSteps(diffrax.AbstractStepSizeController):
         self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, error_order: Any
     ) -> tuple[Any, _Watched]:
         first, state = self.steps.init(terms, t0, t1, y0, dt0, args, func, error_order)
-        return first, _Watched(state, self.shortest * jnp.abs(t1 - t0), jnp.asarray(False))
+        return first, _Watched(state, jnp.asarray(False))
 
     def adapt_step_size(
         self,
@@ -90,26 +88,19 @@ class _AbstractWatchedSteps(diffrax.AbstractStepSizeController):
         error_order: Any,
         controller_state: _Watched,
     ) -> Any:
-        before, shortest, passed = controller_state
-        keep, next_t0, next_t1, made_jump, after, result = self.steps.adapt_step_size(
-            t0, t1, y0, y1_candidate, args, y_error, error_order, before
+        keep, *rest, state, result = self.steps.adapt_step_size(
+            t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state.steps
         )
-        passes, drifted = self.passage(self.direction * t0, y0, self.direction * t1, y1_candidate, args)
-        again = keep & passes & (t1 - t0 > shortest)
-        passed = passed | (keep & ~again & (passes | drifted))
-        next_t0 = jnp.where(again, t0, next_t0)
-        next_t1 = jnp.where(again, t0 + SHORTER * (t1 - t0), next_t1)
-        after = jax.tree.map(lambda old, new: jnp.where(again, old, new), before, after)
-        return keep & ~again, next_t0, next_t1, made_jump, _Watched(after, shortest, passed), result
+        passes = self.passage(self.direction * t0, y0, self.direction * t1, y1_candidate, args)
+        return keep, *rest, _Watched(state, controller_state.passed | (keep & passes)), result
 
 
 class WatchedSteps(_AbstractWatchedSteps):
-    """Steps that are not chosen: none is tried again."""
+    """Steps of a controller without tolerances."""
 
     steps: Any
     passage: Passage
     direction: Any = 1
-    shortest: ClassVar[float] = jnp.inf
 
 
 class WatchedAdaptiveSteps(_AbstractWatchedSteps, diffrax.AbstractAdaptiveStepSizeController):
@@ -118,7 +109,6 @@ class WatchedAdaptiveSteps(_AbstractWatchedSteps, diffrax.AbstractAdaptiveStepSi
     steps: Any
     passage: Passage
     direction: Any = 1
-    shortest: ClassVar[float] = SHORTEST
 
     @property
     def rtol(self) -> Any:

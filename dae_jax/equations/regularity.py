@@ -21,7 +21,7 @@ LARGE = 0.25
 LEFT = 100
 DRIFTED = 1000
 # The change of the constraints' gradients on the way back from a drift that is suspicious, as one part in so many of them.
-FAR = 20
+FAR = 6
 # Tolerances that stand in for those of fixed steps.
 COARSE = 1e-3
 

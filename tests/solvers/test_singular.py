@@ -133,7 +133,7 @@ class TestMasses:
             solve(pendulum(mass=jnp.array(mass)), diffrax.Euler(), dt0=0.1)
 
     def test_round_off_is_symmetric(self):
-        solve(pendulum(mass=jnp.array([[2.0, 1.0 + 1e-15], [1.0, 2.0]])), diffrax.Euler(), dt0=0.1)
+        solve(pendulum(mass=jnp.array([[2.0, 1.0 + 1e-15], [1.0, 2.0]])), diffrax.Euler(), dt0=0.01)
 
     @pytest.mark.parametrize(
         "mass",
@@ -261,7 +261,8 @@ class TestSingularConfiguration:
         c, s = np.cos(0.5), np.sin(0.5)
         y0 = (jnp.array([c, s, 2 * c]), jnp.array([-s, c, -2 * s]))
         saveat = diffrax.SaveAt(t0=True, t1=True)
-        sol = solve(system, dae_jax.TangentSpace(diffrax.Dopri8()), y0, t1=3.0, saveat=saveat)
+        with pytest.warns(dae_jax.AccuracyWarning, match="dead centre"):
+            sol = solve(system, dae_jax.TangentSpace(diffrax.Dopri8()), y0, t1=3.0, saveat=saveat)
         energy = dae_jax.energy(system, sol)
         assert abs(energy[1] - energy[0]) < 1e-5
         np.testing.assert_allclose(sol.ys[0][1, 2], 2 * sol.ys[0][1, 0], atol=1e-6)
