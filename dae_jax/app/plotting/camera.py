@@ -1,0 +1,57 @@
+"""From points in space to points in a picture."""
+
+import itertools
+
+import numpy as np
+from jaxtyping import Float
+
+
+# From where a scene is seen, in degrees, and from how far, in half diagonals of the box around it.
+AZIMUTH, ELEVATION, DISTANCE = -55.0, 18.0, 4.0
+
+
+class Camera:
+    """Central perspective of what is in a box; the third coordinate points up, or `down`.
+
+    - `box`: (2, 3), the lowest and the highest coordinates of all that is to be seen, in m.
+    """
+
+    def __init__(self, box: Float[np.ndarray, "2 3"], down: bool = False) -> None:
+        self.box, self.middle = box, box.mean(0)
+        self.radius = float(np.linalg.norm(np.ptp(box, axis=0))) / 2 or 1.0
+        azimuth, elevation = np.radians((AZIMUTH, ELEVATION))
+        (sa, ca), (se, ce) = ((np.sin(x), np.cos(x)) for x in (azimuth, elevation))
+        axes = np.array([[-sa, ca, 0.0], [-se * ca, -se * sa, ce], [ce * ca, ce * sa, se]])
+        # Down is made up by half a turn about x, not by a mirror: right-handed coordinates stay so.
+        self.axes = axes * (np.array([1.0, -1.0, -1.0]) if down else 1.0)
+        self.ground = float(box[1, 2] if down else box[0, 2])
+
+    def __call__(self, points: Float[np.ndarray, "*frames 3"]) -> Float[np.ndarray, "*frames 3"]:
+        """To the right, upwards and towards the eye, in m at the middle of the box; what is nearer is larger."""
+        right, up, near = np.moveaxis((points - self.middle) @ self.axes.T, -1, 0)
+        size = DISTANCE * self.radius / (DISTANCE * self.radius - near)
+        return np.stack([size * right, size * up, near], -1)
+
+    def shadow(self, points: Float[np.ndarray, "*frames 3"]) -> Float[np.ndarray, "*frames 3"]:
+        """The points below, or above where `down`, on the ground."""
+        return np.concatenate([points[..., :2], np.full_like(points[..., 2:], self.ground)], -1)
+
+    def corners(self) -> Float[np.ndarray, "8 3"]:
+        """Those of the box, in the picture."""
+        return self(np.array(list(itertools.product(*self.box.T))))
+
+    def grid(self, cells: int = 8) -> tuple[float, Float[np.ndarray, "lines 2 3"]]:
+        """Lines on the ground, in the picture, and how far apart they are, in m: 1, 2 or 5 times a power of ten."""
+        low, high = self.box[:, :2]
+        step = nice(float((high - low).max() or 1.0) / cells)
+        (x, right), (y, far) = ((np.floor(a / step) * step, np.ceil(b / step) * step) for a, b in zip(low, high, strict=True))
+        along = [[(u, y), (u, far)] for u in np.arange(x, right + step / 2, step)]
+        across = [[(x, v), (right, v)] for v in np.arange(y, far + step / 2, step)]
+        flat = np.array(along + across)
+        return step, self(self.shadow(np.concatenate([flat, np.zeros((*flat.shape[:2], 1))], -1)))
+
+
+def nice(step: float) -> float:
+    """The next of 1, 2, 5, 10, … times a power of ten."""
+    power = 10.0 ** np.floor(np.log10(step))
+    return float(power * next(k for k in (1, 2, 5, 10) if k * power >= step * (1 - 1e-12)))
