@@ -15,7 +15,7 @@ from ...systems import System, is_mechanism
 from ...validate.states import brief, refuse_wrong_system
 from .camera import Camera
 from .film import figure_at, write_gif, write_mp4
-from .motion import Points, drawing_of, frame_times, motion, saved_states
+from .motion import FPS, Points, drawing_of, frame_times, motion, saved_states
 from .player import inline, page
 
 
@@ -63,10 +63,7 @@ class Animation:
     @property
     def camera(self) -> Camera | None:
         """Through which what is in space is seen; `None` in the plane."""
-        if self.points.shape[2] == 2:
-            return None
-        flat = self.points.reshape(-1, 3)
-        return Camera(np.stack([flat.min(0), flat.max(0)]), self.drawing.down)
+        return Camera.around_motion(self.points, self.drawing.down) if self.points.shape[2] == 3 else None
 
     @property
     def fixed(self) -> list[int]:
@@ -89,12 +86,11 @@ class Animation:
         Errors: `ValueError` for another ending; `RuntimeError` for an mp4 without ffmpeg; `OSError` where none can be written.
         """
         path = Path(path)
-        kind = path.suffix.lower()
-        refuse_film_type(kind)
-        if kind == ".html":
+        refuse_film_type(path)
+        if path.suffix.lower() == ".html":
             path.write_text(self.html(), encoding="utf-8")
         else:
-            (write_gif if kind == ".gif" else write_mp4)(self, path)
+            (write_gif if path.suffix.lower() == ".gif" else write_mp4)(self, path)
         return path
 
     def _repr_html_(self) -> str:
@@ -107,7 +103,7 @@ def animate(
     *,
     system: System | None = None,
     speed: float | None = None,
-    fps: float = 50.0,
+    fps: float = FPS,
     trace: float | None = None,
     title: str | None = None,
 ) -> Animation:
@@ -150,12 +146,17 @@ def animate(
     )
 
 
-def refuse_film_type(kind: str) -> None:
+def refuse_film_type(path: Path) -> None:
     """An ending that no animation can be saved with, and .mp4 without the program that writes it."""
+    kind = path.suffix.lower()
     if kind not in FILM_TYPES:
-        raise ValueError(f"an animation is saved as {', '.join(FILM_TYPES)}, not as {kind or 'a file without an ending'!r}")
+        raise ValueError(
+            f"An animation is saved as {', '.join(FILM_TYPES)}, not as {kind or 'a file without an ending'}."
+        )
     if kind == ".mp4" and shutil.which("ffmpeg") is None:
-        raise RuntimeError("an .mp4 is written by the program ffmpeg, which is not found: install it, or save .html or .gif")
+        raise RuntimeError(
+            "An .mp4 is written by the program ffmpeg, which is not found: install it, or save .html or .gif."
+        )
 
 
 def _with_names(drawing: Drawing, count: int) -> Drawing:

@@ -26,6 +26,12 @@ class Camera:
         self.axes = axes * (np.array([1.0, -1.0, -1.0]) if down else 1.0)
         self.ground = float(box[1, 2] if down else box[0, 2])
 
+    @classmethod
+    def around_motion(cls, points: Float[np.ndarray, "frames points 3"], down: bool) -> "Camera":
+        """With all that points reach in the picture."""
+        flat = points.reshape(-1, 3)
+        return cls(np.stack([flat.min(0), flat.max(0)]), down)
+
     def __call__(self, points: Float[np.ndarray, "*frames 3"]) -> Float[np.ndarray, "*frames 3"]:
         """To the right, upwards and towards the eye, in m at the middle of the box; what is nearer is larger."""
         right, up, near = np.moveaxis((points - self.middle) @ self.axes.T, -1, 0)
@@ -36,15 +42,18 @@ class Camera:
         """The points below, or above where `down`, on the ground."""
         return np.concatenate([points[..., :2], np.full_like(points[..., 2:], self.ground)], -1)
 
-    def corners(self) -> Float[np.ndarray, "8 3"]:
-        """Those of the box, in the picture."""
-        return self(np.array(list(itertools.product(*self.box.T))))
+    def around(self) -> Float[np.ndarray, "around 2"]:
+        """What has to be in the picture: the corners of the box, and the ground."""
+        corners = self(np.array(list(itertools.product(*self.box.T))))
+        return np.concatenate([corners[:, :2], self.grid()[1][..., :2].reshape(-1, 2)])
 
     def grid(self, cells: int = 8) -> tuple[float, Float[np.ndarray, "lines 2 3"]]:
         """Lines on the ground, in the picture, and how far apart they are, in m: 1, 2 or 5 times a power of ten."""
         low, high = self.box[:, :2]
         step = nice(float((high - low).max() or 1.0) / cells)
-        (x, right), (y, far) = ((np.floor(a / step) * step, np.ceil(b / step) * step) for a, b in zip(low, high, strict=True))
+        (x, right), (y, far) = (
+            (np.floor(a / step) * step, np.ceil(b / step) * step) for a, b in zip(low, high, strict=True)
+        )
         along = [[(u, y), (u, far)] for u in np.arange(x, right + step / 2, step)]
         across = [[(x, v), (right, v)] for v in np.arange(y, far + step / 2, step)]
         flat = np.array(along + across)

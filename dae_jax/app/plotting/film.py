@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from .camera import Camera
 from .common import BLANK, COLOURS, GREY, legend_below
+from .plane import draw_ground
 
 
 if TYPE_CHECKING:
@@ -31,7 +33,6 @@ class Stage:
         camera = animation.camera
         self.seen = animation.points if camera is None else camera(animation.points)[..., :2]
         self.shadows = None if camera is None else camera(camera.shadow(animation.points))[..., :2]
-        self.depth = None if camera is None else camera(animation.points)[..., 2]
         self.figure, self.axes, self.strip = self._figure()
         self.moving: list[Any] = []
         self._still(camera)
@@ -40,11 +41,12 @@ class Stage:
     def _figure(self) -> tuple[Any, Any, Any]:
         """Axes that the motion fills at equal scales, and below them those of the drift."""
         from matplotlib.figure import Figure
+        from matplotlib.layout_engine import ConstrainedLayoutEngine
 
         camera = self.film.camera
         around = self.seen.reshape(-1, 2)
         if camera is not None:
-            around = np.concatenate([around, camera.corners()[:, :2], camera.grid()[1][..., :2].reshape(-1, 2)])
+            around = np.concatenate([around, camera.around()])
         low, high = around.min(0), around.max(0)
         margin = 0.06 * ((high - low).max() or 1.0)
         size = np.maximum(high - low + 2 * margin, 0.35 * (high - low).max() + 2 * margin)
@@ -52,8 +54,8 @@ class Stage:
         width, height = size * min(6.0 / size[0], 4.6 / size[1])
         strip = self.film.violation is not None
         inches = (max(width, 3.4) + 0.7, height + 1.2 + 1.1 * strip)
-        figure = Figure(figsize=tuple(np.round(np.array(inches) * DPI / 2) * 2 / DPI), layout="constrained", dpi=DPI)
-        figure.get_layout_engine().set(w_pad=0.1, h_pad=0.1)  # pyright: ignore[reportOptionalMemberAccess]
+        even = np.round(np.array(inches) * DPI / 2) * 2 / DPI
+        figure = Figure(figsize=(even[0], even[1]), layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1), dpi=DPI)
         rows = figure.subplots(1 + strip, 1, squeeze=False, height_ratios=[height, 0.9][: 1 + strip])[:, 0]
         axes = rows[0]
         limits = np.stack([middle - size / 2, middle + size / 2])
@@ -61,7 +63,7 @@ class Stage:
         axes.set_title(self.film.title, loc="left", fontsize="medium", fontweight="bold")
         return figure, axes, rows[1] if strip else None
 
-    def _still(self, camera: Any) -> None:
+    def _still(self, camera: Camera | None) -> None:
         """What does not move: the axes or the ground, the drift, the legend."""
         drawing, axes = self.film.drawing, self.axes
         if camera is None:
@@ -70,28 +72,24 @@ class Stage:
             if drawing.down:
                 axes.invert_yaxis()
         else:
-            step, lines = camera.grid()
-            for line in lines[..., :2]:
-                axes.plot(*line.T, color=BLANK, linewidth=0.8, zorder=0)
-            axes.set_axis_off()
-            axes.text(0, 0, f"grid {step:g} m", transform=axes.transAxes, color=GREY, fontsize="small", va="bottom")
+            draw_ground(axes, camera)
         names = [axes.plot([], [], "o", color=c, label=n)[0] for n, _, c in paths(self.film)]
-        if self.strip is not None:
-            self._draw_drift(self.strip)
+        if self.film.violation is not None:
+            self._draw_drift(self.strip, *self.film.violation)
         if names:
             legend_below(self.figure, min(len(names), 4), names)
 
-    def _draw_drift(self, strip: Any) -> None:
-        times, values = self.film.violation or ((), ())
+    def _draw_drift(self, strip: Any, times: Float[np.ndarray, " saved"], values: Float[np.ndarray, " saved"]) -> None:
         strip.grid(alpha=0.3, linewidth=0.5)
         strip.set(xlabel="time in s", xlim=(times[0], times[-1]), ylabel=f"max |{self.film.violated}|")
-        if np.max(values) > 0:
-            low, high = decades(np.asarray(values))
+        if np.any(values > 0):
+            low, high = decades(values)
             # What is exactly 0 lies on the axis.
             strip.plot(times, np.maximum(values, low), color=INK, linewidth=0.9, zorder=2)
             strip.set(yscale="log", ylim=(low, high))
         else:
-            strip.text(0.5, 0.5, "exactly 0", transform=strip.transAxes, ha="center", va="center", color=GREY)
+            words = "exactly 0" if np.isfinite(values).all() else "not a number"
+            strip.text(0.5, 0.5, words, transform=strip.transAxes, ha="center", va="center", color=GREY)
             strip.set_yticks([])
 
     def _movable(self) -> None:
@@ -108,7 +106,9 @@ class Stage:
         style = {"color": INK, "solid_capstyle": "round", "solid_joinstyle": "round"}
         self.links = [add(axes, [], [], linewidth=3.2, **style) for _ in drawing.links]
         self.springs = [add(axes, [], [], linewidth=1.3, **style) for _ in drawing.springs]
-        self.pivots = add(axes, [], [], "^", color="black", markersize=10)
+        # In space a triangle on the end of a rod would be an arrow.
+        flat = self.shadows is None
+        self.pivots = add(axes, [], [], "^" if flat else "s", color="black", markersize=10 if flat else 7)
         self.joints = add(axes, [], [], "o", color="white", markeredgecolor=INK, markeredgewidth=1.4, markersize=6)
         dots = [add(axes, [], [], "o", color=c, markeredgecolor="white", markersize=11) for _, _, c in paths(self.film)]
         self.masses = dots
@@ -144,7 +144,7 @@ class Stage:
             self.now.set_data([film.times[k]] * 2, [low, high])
             times, values = film.violation or ((), ())
             nearest = np.argmin(np.abs(times - film.times[k]))
-            self.dot.set_data([film.times[k]], [max(values[nearest], low)])
+            self.dot.set_data([film.times[k]], [np.maximum(values[nearest], low)])
 
     def _place_masses(self, k: int) -> None:
         film = self.film
@@ -156,8 +156,6 @@ class Stage:
             fading = np.isfinite(film.trace)
             strength = np.linspace(0.05, 0.9, len(path) - 1) if fading else np.full(len(path) - 1, 0.6)
             trail.set_color([(colour, alpha) for alpha in strength])
-            if self.depth is not None:
-                dot.set_zorder(3 + 0.1 * float(self.depth[k, mass] > 0))
 
     def frames(self, every: int = 1) -> "Iterator[Pixels]":
         """The first frame and every so many after it; what stands still is drawn once."""
@@ -185,14 +183,15 @@ def paths(film: "Animation") -> list[tuple[str, int, str]]:
 
 
 def joints(film: "Animation") -> list[int]:
-    """The points of links that are neither fixed nor of interest."""
+    """The points where bodies or springs meet, that are neither fixed nor of interest."""
+    ends = [k for pair in (*film.drawing.links, *film.drawing.springs) for k in pair]
     other = {*film.fixed, *film.drawing.masses.values()}
-    return sorted({k for pair in film.drawing.links for k in pair} - other)
+    return sorted({k for k in ends if ends.count(k) > 1} - other)
 
 
 def decades(values: Float[np.ndarray, " saved"]) -> tuple[float, float]:
     """Whole powers of ten around the values that are positive, two at least."""
-    exponents = np.log10(values[values > 0])
+    exponents = np.log10(values[(values > 0) & np.isfinite(values)])
     low, high = np.floor(exponents.min()), np.ceil(exponents.max())
     return 10.0**low, 10.0 ** max(high, low + 2)
 
@@ -201,8 +200,8 @@ def coil(a: Float[np.ndarray, "2"], b: Float[np.ndarray, "2"], width: float) -> 
     """A spring from one point to another, as a zigzag with straight ends."""
     along = b - a
     across = np.array([-along[1], along[0]]) / (np.linalg.norm(along) or 1.0)
-    place = np.r_[0, np.linspace(0.15, 0.85, 2 * COILS + 1), 1]
-    side = np.r_[0, 0, np.tile([1, -1], COILS)[:-1], 0, 0]
+    place = np.r_[0, np.linspace(0.15, 0.85, 2 * COILS + 2), 1]
+    side = np.r_[0, 0, np.tile([1, -1], COILS), 0, 0]
     return a + place[:, None] * along + width * side[:, None] * across
 
 

@@ -1,7 +1,7 @@
 """Where the points of a drawing are at evenly spaced times, from a solution that was saved at any."""
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -16,9 +16,9 @@ from ...types import State, Time
 from ...validate.states import brief
 
 
-# Frames of a film in memory; a film longer than SHORT and shorter than LONG runs in real time where no speed is asked for,
-# any other lasts USUAL, in s.
-MOST, SHORT, USUAL, LONG = 20_000, 1.0, 10.0, 120.0
+# Frames in a second of a film, and in all at most. One that is shorter than SHORT or longer than LONG in real time takes
+# USUAL where no speed is asked for, in s.
+FPS, MOST, SHORT, USUAL, LONG = 50.0, 20_000, 1.0, 10.0, 120.0
 # What a point may be off between saved times, in parts of the extent of the motion.
 SEEN = 0.01
 
@@ -67,7 +67,7 @@ def saved_states(sol: DAESolution) -> tuple[np.ndarray, State]:
     return times[kept], jax.tree.map(lambda y: np.asarray(y)[kept], sol.ys)
 
 
-def frame_times(times: np.ndarray, fps: float, speed: float | None) -> tuple[float, np.ndarray]:
+def frame_times(times: Sequence[float] | np.ndarray, fps: float, speed: float | None) -> tuple[float, np.ndarray]:
     """Seconds shown in a second, and the times of the frames."""
     span = float(abs(times[-1] - times[0]))
     if speed is None:
@@ -75,8 +75,8 @@ def frame_times(times: np.ndarray, fps: float, speed: float | None) -> tuple[flo
     count = int(span / speed * fps * (1 + 1e-12)) + 1
     if not 2 <= count <= MOST:
         raise ValueError(
-            f"{span:g} s at `speed={speed:g}` and `fps={fps:g}` are {count} frames; between 2 and {MOST} can be shown: "
-            f"`speed={span / USUAL:.3g}` takes {USUAL:g} s."
+            f"{span:g} s at speed {speed:g} and {fps:g} frames a second are {count} frames, but must be 2 to {MOST}: at speed "
+            f"{span / USUAL:.3g} they take {USUAL:g} s."
         )
     return speed, times[0] + np.sign(times[-1] - times[0]) * speed / fps * np.arange(count)
 
@@ -127,7 +127,9 @@ def _refuse_wrong_points(drawing: Drawing, times: np.ndarray, states: State) -> 
     first = jax.tree.map(lambda y: jax.ShapeDtypeStruct(y.shape[1:], y.dtype), states)
     shape = np.shape(jax.eval_shape(drawing.points, times[0], first))
     if len(shape) != 2 or shape[1] not in (2, 3) or not shape[0]:
-        raise ValueError(f"points(t, q) must give positions of the shape (points, 2) or (points, 3), but gives {shape}.")
+        raise ValueError(
+            f"points(t, q) must give positions of the shape (points, 2) or (points, 3), but gives {shape}."
+        )
     named = [*drawing.masses.values(), *(k for pair in (*drawing.links, *drawing.springs) for k in pair)]
     wrong = [k for k in named if not 0 <= k < shape[0]]
     if wrong:
@@ -143,9 +145,9 @@ def _finite(points: Array) -> np.ndarray:
 
 def _linear(times: np.ndarray, points: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Between neighbours."""
-    from scipy.interpolate import interp1d
-
-    return interp1d(times, points, axis=0, fill_value="extrapolate", assume_sorted=False)(at)
+    order = np.argsort(times)
+    flat = points[order].reshape(len(times), -1)
+    return np.stack([np.interp(at, times[order], x) for x in flat.T], 1).reshape(len(at), *points.shape[1:])
 
 
 def _cubic(times: np.ndarray, points: np.ndarray, rates: np.ndarray, at: np.ndarray) -> np.ndarray:
