@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 from html.parser import HTMLParser
+from typing import Any
 
 import diffrax
 import jax
@@ -29,7 +30,7 @@ from dae_jax.scenes import SCENES, Drawing
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 
-def solution(name, times):
+def solution(name: str, times) -> tuple[Any, Any]:
     scene = SCENES[name]()
     return scene, solve(scene, methods(scene)["projection-tsit5"], np.asarray(times), 1e-10)
 
@@ -65,7 +66,7 @@ def test_points_are_where_an_independent_solution_has_them(name):
 
 
 def test_dense_output_is_taken_where_it_is():
-    scene = SCENES["pendulum"]()
+    scene: Any = SCENES["pendulum"]()
     sol = dae_jax.daesolve(
         scene.system, dae_jax.OrthogonalProjection(diffrax.Tsit5()), 0.0, 1.0, None, scene.y0,
         saveat=diffrax.SaveAt(ts=jnp.array([0.0, 1.0]), dense=True), max_steps=300,
@@ -112,7 +113,7 @@ def test_the_drift_is_that_of_the_saved_states(double, film):
     np.testing.assert_array_equal(values, dae_jax.drift(scene.system, sol).position)
     assert plotting.animate(scene.drawing, sol).violation is None
     knife, of_knife = solution("knife-edge", np.linspace(0, 2, 41))
-    edge = plotting.animate(knife, of_knife)
+    edge: Any = plotting.animate(knife, of_knife)
     assert edge.violated == "h"
     np.testing.assert_array_equal(edge.violation[1], dae_jax.drift(knife.system, of_knife).velocity)
 
@@ -158,6 +159,17 @@ def test_a_spring_is_drawn_from_end_to_end():
     across = (corners - a) @ np.array([-4, 3]) / 5
     assert np.abs(across).max() == pytest.approx(0.2)
     assert across.sum() == pytest.approx(0)
+
+
+@pytest.mark.parametrize("dimensions", [2, 3])
+def test_what_rests_is_drawn_at_a_size_of_its_own(double, dimensions):
+    _, sol = double
+    still = jnp.ones((len(sol.ts), dimensions))
+    sol = dataclasses.replace(sol, ys=(still, 0 * still))
+    film = sol.animate(lambda t, q: q[None] + 1e-17 * t)
+    (left, right), (bottom, top) = film.figure(0.0).axes[0].get_xlim(), film.figure(0.0).axes[0].get_ylim()
+    assert 0.1 < right - left < 10
+    assert 0.1 < top - bottom < 10
 
 
 # Pictures

@@ -14,7 +14,7 @@ from ...solution import DAESolution
 from ...systems import System, is_mechanism
 from ...validate.states import brief, refuse_wrong_system
 from .camera import Camera
-from .film import figure_at, write_gif, write_mp4
+from .film import DPI, figure_at, write_gif, write_mp4
 from .motion import FPS, Points, drawing_of, frame_times, motion, saved_states
 from .player import inline, page
 
@@ -80,8 +80,9 @@ class Animation:
         """A page that plays it, with all that it needs in it: a slider, keys, the drift; what is in space can be turned."""
         return page(self)
 
-    def save(self, path: str | Path) -> Path:
-        """Writes it, by the file's ending: .html, a page of its own; .gif; .mp4, where the program ffmpeg is.
+    def save(self, path: str | Path, *, dpi: float = DPI) -> Path:
+        """Writes it, by the file's ending: .html, a page of its own; .gif; .mp4, where the program ffmpeg is. `dpi`: dots in an
+        inch of the last two, whose frames are up to 6.7 inches wide.
 
         Errors: `ValueError` for another ending; `RuntimeError` for an mp4 without ffmpeg; `OSError` where none can be written.
         """
@@ -90,7 +91,7 @@ class Animation:
         if path.suffix.lower() == ".html":
             path.write_text(self.html(), encoding="utf-8")
         else:
-            (write_gif if path.suffix.lower() == ".gif" else write_mp4)(self, path)
+            (write_gif if path.suffix.lower() == ".gif" else write_mp4)(self, path, dpi)
         return path
 
     def _repr_html_(self) -> str:
@@ -98,7 +99,7 @@ class Animation:
 
 
 def animate(
-    what: Scene | Drawing | Points,
+    what: Scene[System] | Drawing | Points,
     sol: DAESolution,
     *,
     system: System | None = None,

@@ -18,7 +18,7 @@ class Camera:
 
     def __init__(self, box: Float[np.ndarray, "2 3"], down: bool = False) -> None:
         self.box, self.middle = box, box.mean(0)
-        self.radius = float(np.linalg.norm(np.ptp(box, axis=0))) / 2 or 1.0
+        self.radius = extent(box) / 2
         azimuth, elevation = np.radians((AZIMUTH, ELEVATION))
         (sa, ca), (se, ce) = ((np.sin(x), np.cos(x)) for x in (azimuth, elevation))
         axes = np.array([[-sa, ca, 0.0], [-se * ca, -se * sa, ce], [ce * ca, ce * sa, se]])
@@ -49,15 +49,23 @@ class Camera:
 
     def grid(self, cells: int = 8) -> tuple[float, Float[np.ndarray, "lines 2 3"]]:
         """Lines on the ground, in the picture, and how far apart they are, in m: 1, 2 or 5 times a power of ten."""
-        low, high = self.box[:, :2]
-        step = nice(float((high - low).max() or 1.0) / cells)
-        (x, right), (y, far) = (
-            (np.floor(a / step) * step, np.ceil(b / step) * step) for a, b in zip(low, high, strict=True)
+        half = np.maximum(np.ptp(self.box[:, :2], axis=0) / 2, 0.3 * self.radius)
+        step = nice(2 * half.max() / cells)
+        (x, y), (right, far) = (
+            step * np.floor((self.middle[:2] - half) / step),
+            step * np.ceil((self.middle[:2] + half) / step),
         )
         along = [[(u, y), (u, far)] for u in np.arange(x, right + step / 2, step)]
         across = [[(x, v), (right, v)] for v in np.arange(y, far + step / 2, step)]
         flat = np.array(along + across)
         return step, self(self.shadow(np.concatenate([flat, np.zeros((*flat.shape[:2], 1))], -1)))
+
+
+def extent(points: Float[np.ndarray, "*points dimensions"]) -> float:
+    """The diagonal of the box around points; where they do not move, how far off the origin they are, or 1 m."""
+    flat = points.reshape(-1, points.shape[-1])
+    diagonal, far = float(np.linalg.norm(np.ptp(flat, axis=0))), float(np.abs(flat).max())
+    return diagonal if diagonal > 2e-6 * far else 2 * far or 1.0
 
 
 def nice(step: float) -> float:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from .camera import Camera
+from .camera import Camera, extent
 from .common import BLANK, COLOURS, GREY, legend_below
 from .plane import draw_ground
 
@@ -28,8 +28,8 @@ COILS = 7
 class Stage:
     """A figure of an animation: what stands still drawn once, and what moves put in place frame by frame."""
 
-    def __init__(self, animation: "Animation") -> None:
-        self.film = animation
+    def __init__(self, animation: "Animation", dpi: float = DPI) -> None:
+        self.film, self.dpi = animation, dpi
         camera = animation.camera
         self.seen = animation.points if camera is None else camera(animation.points)[..., :2]
         self.shadows = None if camera is None else camera(camera.shadow(animation.points))[..., :2]
@@ -48,14 +48,15 @@ class Stage:
         if camera is not None:
             around = np.concatenate([around, camera.around()])
         low, high = around.min(0), around.max(0)
-        margin = 0.06 * ((high - low).max() or 1.0)
-        size = np.maximum(high - low + 2 * margin, 0.35 * (high - low).max() + 2 * margin)
+        whole = extent(around)
+        size = np.maximum(high - low, 0.3 * whole) + 0.1 * whole
+        size[0] = max(size[0], 0.8 * size[1])  # the title and the time side by side
         middle = (low + high) / 2
         width, height = size * min(6.0 / size[0], 4.6 / size[1])
         strip = self.film.violation is not None
-        inches = (max(width, 3.4) + 0.7, height + 1.2 + 1.1 * strip)
-        even = np.round(np.array(inches) * DPI / 2) * 2 / DPI
-        figure = Figure(figsize=(even[0], even[1]), layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1), dpi=DPI)
+        inches = (width + 0.7, height + 1.2 + 1.1 * strip)
+        even = np.round(np.array(inches) * self.dpi / 2) * 2 / self.dpi
+        figure = Figure(figsize=(even[0], even[1]), layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1), dpi=self.dpi)
         rows = figure.subplots(1 + strip, 1, squeeze=False, height_ratios=[height, 0.9][: 1 + strip])[:, 0]
         axes = rows[0]
         limits = np.stack([middle - size / 2, middle + size / 2])
@@ -214,33 +215,48 @@ def time_of(film: "Animation", k: int) -> str:
 
 def figure_at(film: "Animation", k: int) -> Any:
     """The frame `k` as a figure."""
-    stage = Stage(film)
+    stage = Stage(film, 2 * DPI)
     stage.place(k)
-    stage.figure.set_dpi(2 * DPI)
     return stage.figure
 
 
-def write_gif(film: "Animation", path: Path) -> None:
+def write_gif(film: "Animation", path: Path, dpi: float) -> None:
     """Every so many frames, with colours in common, each shown for as long as it takes, in hundredths of a second on average."""
     from PIL import Image
 
     every = int(np.ceil(film.fps / GIF_FPS))
-    pictures = [Image.fromarray(pixels[..., :3]) for pixels in Stage(film).frames(every)]
-    some = np.concatenate([np.asarray(pictures[k]) for k in np.linspace(0, len(pictures) - 1, 6).astype(int)])
-    palette = Image.fromarray(some).quantize(64, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
-    colours = np.reshape(palette.getpalette() or (), (-1, 3))
-    colours[np.argmax(colours.sum(1))] = 255  # the paper is white, not the mean of what is nearly so
-    palette.putpalette(colours.ravel().tolist())
-    first, *others = (picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures)
+    colours = _tints({"#000000", INK, GREY, COLOURS[1], *(colour for _, _, colour in paths(film))})
+    nearest = _nearest(colours)
+    pictures = []
+    for pixels in Stage(film, dpi).frames(every):
+        red, green, blue = np.moveaxis(pixels[..., :3] >> 3, -1, 0)
+        pictures.append(Image.fromarray(nearest[red, green, blue]))
+        pictures[-1].putpalette(colours.ravel().tolist())
+    first, *others = pictures
     ends = np.round(100 * every / film.fps * np.arange(len(pictures) + 1)).astype(int)
     durations = (10 * np.maximum(np.diff(ends), 1)).tolist()
     first.save(path, "GIF", save_all=True, append_images=others, duration=durations, loop=0, optimize=True)
 
 
-def write_mp4(film: "Animation", path: Path) -> None:
+def _tints(colours: set[str], steps: int = 12) -> UInt8[np.ndarray, "colours 3"]:
+    """White, and colours from faint to full: all that is drawn, smoothed at its edges."""
+    full = np.array([[int(colour[i : i + 2], 16) for i in (1, 3, 5)] for colour in sorted(colours)])
+    share = np.arange(1, steps + 1)[:, None, None] / steps
+    return np.r_[[[255, 255, 255]], np.round(255 + share * (full - 255)).reshape(-1, 3)].astype(np.uint8)
+
+
+def _nearest(colours: UInt8[np.ndarray, "colours 3"]) -> UInt8[np.ndarray, "32 32 32"]:
+    """Which colour is nearest to red, green and blue of five bits each."""
+    level = np.arange(32) * 255 / 31
+    squares = (level[:, None] - colours.T[:, None, :]) ** 2
+    distance = squares[0][:, None, None] + squares[1][None, :, None] + squares[2][None, None, :]
+    return np.argmin(distance, -1).astype(np.uint8)
+
+
+def write_mp4(film: "Animation", path: Path, dpi: float) -> None:
     """All frames, by ffmpeg."""
-    stage = Stage(film)
-    width, height = (round(x * DPI) for x in stage.figure.get_size_inches())
+    stage = Stage(film, dpi)
+    width, height = (round(x * dpi) for x in stage.figure.get_size_inches())
     command = (
         f"ffmpeg -loglevel error -y -f rawvideo -pix_fmt rgba -s {width}x{height} -r {film.fps} -i - -an -pix_fmt yuv420p "
         "-movflags +faststart"

@@ -22,10 +22,11 @@ FPS, MOST, SHORT, USUAL, LONG = 50.0, 20_000, 1.0, 10.0, 120.0
 # What a point may be off between saved times, in parts of the extent of the motion.
 SEEN = 0.01
 
-Points = Callable[[Time, State], Array]
+# points(t, q), as in a `Drawing`.
+Points = Callable[[Any, Any], Any]
 
 
-def drawing_of(what: Scene | Drawing | Points) -> Drawing:
+def drawing_of(what: Scene[System] | Drawing | Points) -> Drawing:
     """The drawing of a scene, or of a function of t and q that gives points: these are then all of interest."""
     if isinstance(what, Scene):
         if what.drawing is None:
