@@ -2,7 +2,8 @@
 
 A notebook's title is its first heading, its question the first line in italics, its picture the first of its figures. A
 scene is solved and drawn; `python notebooks/gallery/write.py SCENE ...` draws only these again. What a picture shows is in
-the picture: of which figure it is, or by which method the scene was solved and how far off.
+the picture: of which figure it is, or by which method the scene was solved and how far off. One scene is written as it
+moves, too, for the README.
 """
 
 import base64

@@ -370,6 +370,7 @@ def test_wrong_input_is_refused_in_a_sentence(double):
     refused = [
         (ValueError, "at least two saved times, but the solution has 1; pass `saveat", lambda: plotting.animate(scene, one)),
         (ValueError, "a batch of solutions; animate one of them", lambda: plotting.animate(scene, batch)),
+        (ValueError, "take it outside of `jit`", lambda: jax.jit(lambda s: plotting.animate(scene, s).points)(sol)),
         (ValueError, "saved over time", lambda: plotting.animate(scene, dataclasses.replace(sol, ts=None))),
         (TypeError, "`sol` must be what `daesolve` returns, but is 3", lambda: plotting.animate(scene, 3)),
         (ValueError, "The scene jay has no drawing", lambda: plotting.animate(SCENES["jay"](), sol)),

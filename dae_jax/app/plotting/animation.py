@@ -23,7 +23,7 @@ from .player import inline, page
 FILM_TYPES = (".html", ".gif", ".mp4")
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Animation:
     """A mechanism at evenly spaced times. A notebook shows it; `save` writes it.
 

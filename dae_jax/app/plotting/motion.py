@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ...scenes import Drawing, Scene
@@ -51,6 +52,8 @@ def saved_states(sol: DAESolution) -> tuple[np.ndarray, State]:
     """
     if not isinstance(sol, DAESolution):
         raise TypeError(f"`sol` must be what `daesolve` returns, but is {brief(sol)}.")
+    if any(isinstance(x, Tracer) for x in jax.tree.leaves((sol.ts, sol.ys))):
+        raise ValueError("An animation needs the numbers of a solution: take it outside of `jit`, `vmap` and `grad`.")
     advice = "pass `saveat=diffrax.SaveAt(ts=jnp.linspace(t0, t1, 201))`"
     if not isinstance(sol.ts, jax.Array | np.ndarray):
         raise ValueError(f"An animation needs states saved over time, and of one kind; {advice}, without `subs`.")
