@@ -164,8 +164,8 @@ class DAESolution(eqx.Module):
         return self.interpolation.evaluate(t0, t1, left)
 
     def animate(self, what: object, **options: object) -> Any:
-        """The solution as a moving mechanism: `what` is a scene, a `scenes.Drawing` or a function points(t, q), the options are those
-        of `plotting.animate`. A notebook shows what it gives, and `.save("pendulum.html")`, .gif or .mp4 writes it.
+        """The solution as a moving mechanism: `what` is a scene, a `scenes.Drawing` or a function points(t, q), the options are
+        those of `plotting.animate`. A notebook shows what it gives, and `.save("pendulum.html")`, .gif or .mp4 writes it.
 
         Errors: those of `plotting.animate`.
         """

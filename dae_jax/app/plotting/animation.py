@@ -29,7 +29,8 @@ class Animation:
 
     - `drawing`: what is drawn; `title`: what is said above it.
     - `times`: of the frames, in s; `points`: where the drawing's points are, in m.
-    - `fps`: frames in a second of playing, of which a .gif shows 25 at most; `speed`: seconds of the motion in a second of playing.
+    - `fps`: frames in a second of playing, of which a .gif shows 25 at most; `speed`: seconds of the motion in a second of
+      playing.
     - `trace`: how much of the paths is shown, in s; `inf` for all until now.
     - `violation`: (saved times, largest violation of the constraints there), or `None`; `violated`: of which, by their
       letter in the documentation.
@@ -51,7 +52,8 @@ class Animation:
     def __repr__(self) -> str:
         """What it holds, in a line."""
         played = len(self.times) / self.fps
-        return f"Animation({self.title!r}, {len(self.times)} frames, {played:.3g} s at speed {self.speed:.3g}; save(...) writes it)"
+        length = f"{len(self.times)} frames, {played:.3g} s at speed {self.speed:.3g}"
+        return f"Animation({self.title!r}, {length}; save(...) writes it)"
 
     @property
     def pace(self) -> str:

@@ -221,7 +221,7 @@ def figure_at(film: "Animation", k: int) -> Any:
 
 
 def write_gif(film: "Animation", path: Path, dpi: float) -> None:
-    """Every so many frames, with colours in common, each shown for as long as it takes, in hundredths of a second on average."""
+    """Every so many frames, with colours in common, each shown for as long as it takes on average: a gif counts in 0.01 s."""
     from PIL import Image
 
     every = int(np.ceil(film.fps / GIF_FPS))
