@@ -33,7 +33,12 @@ from .formulations import (
     Residual as Residual,
     StateSpace as StateSpace,
 )
-from .solution import RESULTS as RESULTS, AccuracyWarning as AccuracyWarning, DAESolution as DAESolution
+from .solution import (
+    RESULTS as RESULTS,
+    VIEWS as _VIEWS,
+    AccuracyWarning as AccuracyWarning,
+    DAESolution as DAESolution,
+)
 from .solve import daesolve as daesolve
 from .solvers import (
     BDF as BDF,
@@ -72,6 +77,9 @@ _MODULES = {
     "reductions": ".studies.reductions",
     "scenes": ".scenes",
 }
+
+
+_VIEWS["animate"] = lambda *arguments, **options: __getattr__("plotting").animate(*arguments, **options)
 
 
 def __getattr__(name: str) -> _Any:

@@ -15,6 +15,7 @@ from .equations.residual_form import ResidualForm
 from .equations.taylor import total_derivatives
 from .structure import Block, block_triangular, pantelides
 from .systems import System, is_mechanism
+from .tables import table
 from .types import Args, Flat, State, Time
 from .validate.captured import current
 from .validate.states import counted, refuse_wrong_state
@@ -23,6 +24,8 @@ from .validate.user_functions import refuse_wrong_functions
 
 # A system of more variables is summed up in words; its incidence matrix would not fit a page.
 DRAWN = 60
+# A table in a notebook names so many hidden constraints at most.
+HIDDEN = 8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -164,6 +167,21 @@ class Structure:
         ]
         return "\n".join([*lines, "", *free, *hidden])
 
+    def _repr_html_(self) -> str:
+        """A table for a notebook, and the whole page folded."""
+        freedom = self.mechanical_degrees_of_freedom
+        rows = {
+            "equations": str(len(self.equations)),
+            "index": str(self.index),
+            "degrees of freedom": "" if freedom is None else f"{freedom}, of the mechanism",
+            "initial values to choose": str(self.degrees_of_freedom),
+            "hidden constraints": _named(self.hidden_constraints()),
+            "blocks": str(len(self.blocks)),
+            "nonzeros, bandwidth": f"{self.nonzeros}, {self.bandwidth}",
+            "system Jacobian": "regular near the given state" if self.regular else "singular near the given state",
+        }
+        return table("Structure", {name: text for name, text in rows.items() if text}, str(self))
+
     def _cell(self, row: dict[int, int], i: int, j: int) -> str:
         if j not in row:
             return " ·  "
@@ -202,6 +220,12 @@ def analyse(system: System, t0: Time, y0: State, args: Args = None) -> Structure
         tuple(block_triangular(found.pattern, sigma.transversal)),
         _regular(form, found, *point),
     )
+
+
+def _named(hidden: tuple[tuple[str, int], ...]) -> str:
+    """The first of the hidden constraints, one a line, and how many more there are."""
+    lines = [name + _differentiated(k) for name, k in hidden[:HIDDEN]]
+    return "\n".join([*lines, *([f"and {len(hidden) - HIDDEN} more"] if len(hidden) > HIDDEN else [])])
 
 
 def _differentiated(times: int) -> str:

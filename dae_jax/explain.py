@@ -27,6 +27,7 @@ from .solution import precision_of
 from .solve import prepared
 from .solvers import takes_residuals
 from .systems import ConstrainedSystem, System, is_mechanism
+from .tables import table
 from .types import Args, Controller, Flat, ProgressMeter, Solver, State, Time
 from .validate.states import counted
 
@@ -64,9 +65,15 @@ class Plan:
         return self.compiler != "xla"
 
     def __str__(self) -> str:
+        return "\n".join(f"{name:>20}  {text}" for name, text in self._rows().items())
+
+    def _repr_html_(self) -> str:
+        return table(type(self).__name__, self._rows())
+
+    def _rows(self) -> dict[str, str]:
         why = "".join(f"; {reason}" for reason in self.reasons)
         batch = "lanes of vectors" if self.batch_compiler == "llvm" else "left to XLA"
-        rows = {
+        return {
             "method": self.method,
             "precision": self.precision,
             **self._found(),
@@ -74,7 +81,6 @@ class Plan:
             "batch": batch,
             "left out": "; ".join(self.left_out) or "nothing",
         }
-        return "\n".join(f"{name:>20}  {text}" for name, text in rows.items())
 
     def _found(self) -> dict[str, str]:
         raise NotImplementedError

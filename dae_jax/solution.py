@@ -8,10 +8,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Real
 
 from ._compat import messages
+from .tables import table
 from .types import DType, State, Time
+
+
+# What shows a solution lies on a floor above: the package registers it here, by name.
+VIEWS: dict[str, Callable[..., Any]] = {}
 
 
 class AccuracyWarning(UserWarning):
@@ -156,6 +162,49 @@ class DAESolution(eqx.Module):
         if self.interpolation is None:
             raise ValueError("The solution has no dense output; pass `saveat=diffrax.SaveAt(dense=True)`.")
         return self.interpolation.evaluate(t0, t1, left)
+
+    def animate(self, what: object, **options: object) -> Any:
+        """The solution as a moving mechanism: `what` is a scene, a `scenes.Drawing` or a function points(t, q), the options are
+        those of `plotting.animate`. A notebook shows what it gives, and `.save("pendulum.html")`, .gif or .mp4 writes it.
+
+        Errors: those of `plotting.animate`.
+        """
+        return VIEWS["animate"](what, self, **options)
+
+    def _repr_html_(self) -> str:
+        """A table for a notebook; nothing is computed."""
+        if any(isinstance(x, Tracer) for x in jax.tree.leaves(self)):
+            return table("DAESolution", {"traced": "inside jit, vmap or grad"})
+        return table("DAESolution", _found(self))
+
+
+def _found(sol: DAESolution) -> dict[str, str]:
+    """What a solution holds, in words."""
+    # A batch has those of each.
+    stats = {name: x for name, x in sol.stats.items() if x is not None and np.ndim(x) == 0}
+    counted = {"num_accepted_steps": "accepted", "num_rejected_steps": "rejected"}
+    steps = [f"{int(stats[name])} {word}" for name, word in counted.items() if name in stats]
+    rows = {
+        "result": _result(sol.result),
+        "interval": " to ".join(f"{float(t):g}" if np.ndim(t) == 0 else eqx.tree_pformat(t) for t in (sol.t0, sol.t1)),
+        "saved times": "none" if sol.ts is None else eqx.tree_pformat(sol.ts),
+        "saved states": "none" if sol.ys is None else eqx.tree_pformat(sol.ys),
+        "steps": ", ".join(steps),
+        "compile time": f"{float(stats['compile_seconds']):.3g} s" if "compile_seconds" in stats else "",
+        "dense output": "" if sol.interpolation is None else "sol.evaluate(t)",
+        "independent constraints": "" if sol.rank is None else str(sol.rank),
+        "precision": sol.precision,
+    }
+    return {name: text for name, text in rows.items() if text}
+
+
+def _result(result: Any) -> str:
+    """The message of one code; of a batch, how many solves were successful."""
+    codes = np.asarray(result._value)
+    if codes.ndim == 0:
+        return RESULTS[result]
+    good = int(np.sum(codes == np.asarray(RESULTS.successful._value)))
+    return f"{good} of {codes.size} successful"
 
 
 def precision_of(dtype: DType, controller: diffrax.AbstractStepSizeController) -> str:

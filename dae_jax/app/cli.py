@@ -49,6 +49,7 @@ def _main(argv: list[str] | None) -> int:
     _add_analyse(commands)
     _add_sweep(commands)
     _add_tune(commands)
+    _add_animate(commands)
     bench = commands.add_parser(
         "bench", help="run the benchmarks of a source checkout; `bench --help` lists them", add_help=False
     )
@@ -263,6 +264,47 @@ def _tune(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> int
         for solve, found in zip(solves, point.verification, strict=True):
             print(f"  verified with {solve:41s}{found.error:10.1e}{found.drift:10.1e}")
     print(*paths, sep="\n")
+    return 0
+
+
+def _add_animate(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser("animate", help="show a mechanism as it moves, with its drift beside")
+    parser.add_argument("scene", metavar="SCENE", help="one with a drawing, such as double-pendulum")
+    parser.add_argument("--t1", type=float, help="end time in s; by default the scene's own")
+    parser.add_argument(
+        "--speed",
+        type=float,
+        help="seconds of the motion in a second; by default 1, but 10 s for what is very short or long",
+    )
+    parser.add_argument(
+        "--method", default="projection-dop853", help="by which it is solved; by default projection-dop853"
+    )
+    parser.add_argument("--out", type=Path, help="file, .html, .gif or .mp4; by default animate-SCENE.html")
+    parser.set_defaults(run=_animate)
+
+
+def _animate(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> int:
+    from .compare import chosen, solve
+    from .plotting import animate
+    from .plotting.motion import FPS, frame_times
+
+    scene = options.drawn(parser, arguments.scene)
+    t1 = scene.t1 if arguments.t1 is None else arguments.t1
+    options.refuse_not_positive(parser, **{"--t1": t1})
+    if arguments.speed is not None:
+        options.refuse_not_positive(parser, **{"--speed": arguments.speed})
+    path = arguments.out or Path(f"animate-{arguments.scene}.html")
+    options.refuse_unwritable_film(parser, path)
+    try:
+        (method,) = chosen(scene, [arguments.method]).values()
+        speed, times = frame_times((0.0, t1), FPS, arguments.speed)
+        film = animate(
+            scene, solve(scene, method, times, 1e-8), speed=speed, title=f"{scene.name} by {arguments.method}"
+        )
+    except (RuntimeError, TypeError, ValueError) as refusal:
+        parser.error(str(refusal))
+    print(f"{scene.name}, {t1:g} s by {arguments.method}, {film.pace}")
+    print(film.save(path))
     return 0
 
 

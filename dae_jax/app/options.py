@@ -29,6 +29,17 @@ def mechanism(parser: argparse.ArgumentParser, name: str) -> Any:
     return found
 
 
+def drawn(parser: argparse.ArgumentParser, name: str) -> Any:
+    """The same, of a scene that has a drawing."""
+    from ..scenes import SCENES
+
+    found = scene(parser, name)
+    if found.drawing is None:
+        others = [other for other, make in SCENES.items() if make().drawing is not None]
+        parser.error(f"{name} has no drawing; choose from {', '.join(others)}")
+    return found
+
+
 def refuse_not_positive(parser: argparse.ArgumentParser, **options: float) -> None:
     """Of --option=value, those that no time, step or count can be."""
     for option, value in options.items():
@@ -58,6 +69,21 @@ def refuse_unwritable_picture(parser: argparse.ArgumentParser, path: Path) -> No
 
     if path.suffix not in FILE_TYPES:
         parser.error(f"--out {str(path)!r} must end in {', '.join(FILE_TYPES)}")
+    _refuse_no_place(parser, path)
+
+
+def refuse_unwritable_film(parser: argparse.ArgumentParser, path: Path) -> None:
+    """A file that no animation can be saved as, or where none can be written."""
+    from .plotting.animation import refuse_film_type
+
+    try:
+        refuse_film_type(path)
+    except (RuntimeError, ValueError) as refusal:
+        parser.error(f"--out {str(path)!r}: {refusal}")
+    _refuse_no_place(parser, path)
+
+
+def _refuse_no_place(parser: argparse.ArgumentParser, path: Path) -> None:
     if not path.parent.is_dir() or path.is_dir():
         parser.error(f"--out {str(path)!r} cannot be written: {path.parent} is no folder, or it is one itself")
     writable(parser, path.parent)

@@ -115,6 +115,5 @@ def spherical_pendulum(
 
     start = [polar, 0.0, 0.0]
     y0, reference = embed(0.0, np.array(start)), minimal(field, start, embed)
-    axes = ("x in m, seen from above", "y in m")
-    drawing = Drawing(lambda t, q: jnp.stack([jnp.zeros(2), q[:2]]), {"mass": 1}, links=((0, 1),), t1=2.5, axes=axes)
+    drawing = Drawing(lambda t, q: jnp.stack([jnp.zeros(3), q]), {"mass": 1}, links=((0, 1),), down=True, t1=2.5)
     return Scene("spherical-pendulum", system, y0, 10.0, reference, drawing=drawing)

@@ -18,23 +18,23 @@ S = TypeVar("S", bound=AbstractSystem, covariant=True)
 
 @dataclasses.dataclass(frozen=True)
 class Drawing:
-    """How a mechanism looks in the plane.
+    """How a mechanism looks, in the plane or in space.
 
-    - `points(t, q)`: the positions (points, 2) of pivots, joints and masses, in m; a JAX function.
+    - `points(t, q)`: the positions of pivots, joints and masses in m, (points, 2), or (points, 3) in space; a JAX function.
     - `masses`: the points whose paths are of interest, by their names.
     - `links`, `springs`: the pairs of points with a rigid body or a spring between them.
-    - `down`: whether the second coordinate points down.
+    - `down`: whether the last coordinate points down.
     - `t1`: until when paths can be told apart, in s.
-    - `axes`: what the two coordinates are.
+    - `axes`: what the coordinates are.
     """
 
     points: Callable[[Any, Any], Any]
-    masses: dict[str, int]
+    masses: dict[str, int] = dataclasses.field(default_factory=dict)
     links: tuple[tuple[int, int], ...] = ()
     springs: tuple[tuple[int, int], ...] = ()
     down: bool = False
     t1: float = np.inf
-    axes: tuple[str, str] = ("x in m", "y in m")
+    axes: tuple[str, ...] = ("x in m", "y in m", "z in m")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Scene(Generic[S]):
     - `stiff`: explicit methods are out of the question.
     - `first`: where the solution changes over decades of time: when it begins to, in s.
     - `kinks`: when sources have kinks or jumps, in s: for `jump_ts`.
-    - `drawing`: how to draw it, a mechanism in the plane.
+    - `drawing`: how to draw it, a mechanism.
     - `paper`: the paper's figures that show it, by their names in `dae-jax compare`.
     """
 

@@ -10,7 +10,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from ..validate.states import NUMBERS, brief
+from ..tables import table
+from ..validate.states import NUMBERS, brief, counted
 from .progress import Progress
 
 
@@ -61,6 +62,18 @@ class Tuned(NamedTuple):
         """The point, what was gained and at what cost, in a line."""
         params = jax.tree.map(_short, self.params)
         return f"Tuned(params={params}, loss={self.loss:.6g}, history={self.history}, evaluations={self.evaluations})"
+
+    def _repr_html_(self) -> str:
+        """A table for a notebook."""
+        starts, steps = self.history.loss.shape
+        return table(
+            "Tuned",
+            {
+                "params": str(jax.tree.map(_short, self.params)),
+                "loss": f"{self.history.loss[0, 0]:.6g} → {self.loss:.6g}",
+                "descent": f"{counted(starts, 'start')}, {counted(steps, 'step')}, {counted(self.evaluations, 'evaluation')}",
+            },
+        )
 
 
 class _Point(NamedTuple):

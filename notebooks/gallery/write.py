@@ -2,7 +2,8 @@
 
 A notebook's title is its first heading, its question the first line in italics, its picture the first of its figures. A
 scene is solved and drawn; `python notebooks/gallery/write.py SCENE ...` draws only these again. What a picture shows is in
-the picture: of which figure it is, or by which method the scene was solved and how far off.
+the picture: of which figure it is, or by which method the scene was solved and how far off. One scene is written as it
+moves, too, for the README.
 """
 
 import base64
@@ -17,11 +18,13 @@ from typing import Any
 
 import jax
 import nbformat
+import numpy as np
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 import dae_jax
-from dae_jax.app.compare import chosen, measure
+from dae_jax import plotting
+from dae_jax.app.compare import chosen, measure, solve
 from dae_jax.app.figures import figures
 
 
@@ -29,6 +32,8 @@ HERE = Path(__file__).parent
 NOTEBOOKS = HERE.parent
 SIZE = 320  # pixels of the longer side
 RTOL = 1e-8
+# The scene that moves on the README's page, until when, in s, and with how many dots in an inch.
+MOVING = ("double-pendulum", 4.0, 72)
 HEAD = """# Notebooks
 
 One question each, half a minute to a minute on two cores; their figures are in them.
@@ -120,6 +125,14 @@ def picture(name: str) -> bytes:
     return thumbnail(file.getvalue(), method=method, error=f"{row.error:.0e}")
 
 
+def film(name: str, t1: float) -> plotting.Animation:
+    """A scene as it moves."""
+    scene = dae_jax.scenes.SCENES[name]()
+    method = method_of(scene)
+    times = np.linspace(0, t1, round(50 * t1) + 1)
+    return plotting.animate(scene, solve(scene, chosen(scene, [method])[method], times, RTOL))
+
+
 def scenes() -> str:
     """The text of `notebooks/scenes.md`, of the pictures as they are."""
     end = "This page is written by `python notebooks/gallery/write.py`."
@@ -148,6 +161,8 @@ def main() -> None:
     for name in sys.argv[1:] or dae_jax.scenes.SCENES:
         print(name, file=sys.stderr, flush=True)
         (HERE / "scenes" / f"{name}.png").write_bytes(picture(name))
+        if name == MOVING[0]:
+            film(*MOVING[:2]).save(HERE / f"{name}.gif", dpi=MOVING[2])
     (NOTEBOOKS / "scenes.md").write_text(scenes())
 
 

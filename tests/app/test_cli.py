@@ -180,6 +180,16 @@ WRONG = {
     "tune pendulum --rtol 1e-3": "unrecognized arguments: --rtol 1e-3",
     "tune jay": "jay is no mechanism",
     "tune pendulum --out /proc/nope": "--out '/proc/nope' cannot be written",
+    "animate no-such-scene": "unknown scene 'no-such-scene'",
+    "animate robertson": "robertson has no drawing; choose from andrews",
+    "animate pendulum --t1 0": "--t1 must be positive and finite, but is 0.0",
+    "animate pendulum --speed nan": "--speed must be positive and finite, but is nan",
+    "animate pendulum --speed 1e-9": "but must be 2 to 20000: at speed 1 they take 10 s",
+    "animate pendulum --method magic": "unknown method 'magic'; pendulum knows differentiation",
+    "animate pendulum --rtol 1e-6": "unrecognized arguments: --rtol 1e-6",
+    "animate pendulum --out pendulum.avi": "An animation is saved as .html, .gif, .mp4, not as .avi",
+    "animate pendulum --out no-such-folder/pendulum.gif": "no-such-folder is no folder",
+    "animate pendulum --out /proc/pendulum.html": "cannot be written",
     "bench --parts magic": "invalid choice: 'magic'",
     "bench --repeats 0": "--repeats must be at least 1",
     "bench --quick --peers heyoka_peer": "--quick takes no --peers",
@@ -205,6 +215,7 @@ def test_wrong_arguments_end_with_one_line_and_status_2_before_any_work(line, mo
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(compare, "measure", too_late)
+    monkeypatch.setattr(compare, "solve", too_late)
     monkeypatch.setattr(maps, "sweep", too_late)
     monkeypatch.setattr(maps, "descent", too_late)
     monkeypatch.setattr(stress, "run", too_late)
@@ -222,7 +233,7 @@ def test_every_option_of_every_verb_is_in_the_table():
     """An option that is new says here what it refuses."""
     parser = argparse.ArgumentParser()
     commands = parser.add_subparsers()
-    for add in (cli._add_compare, cli._add_analyse, cli._add_sweep, cli._add_tune):
+    for add in (cli._add_compare, cli._add_analyse, cli._add_sweep, cli._add_tune, cli._add_animate):
         add(commands)
     for verb, command in commands.choices.items():
         options = {option for option in command._option_string_actions if option.startswith("--")} - {"--help"}

@@ -54,6 +54,15 @@ def test_every_scene_has_its_picture(gallery):
             assert len(image.getcolors(1000)) > 10, "an empty picture"
 
 
+def test_one_scene_moves(gallery):
+    name, t1, _ = gallery.MOVING
+    path = GALLERY / f"{name}.gif"
+    assert path.stat().st_size < 300_000
+    assert f"notebooks/gallery/{name}.gif" in (GALLERY.parents[1] / "README.md").read_text()
+    with Image.open(path) as image:
+        assert image.n_frames == round(25 * t1) + 1
+
+
 def test_a_scene_is_solved_and_drawn(gallery):
     drawn, kept = io.BytesIO(gallery.picture("pendulum")), GALLERY / "scenes" / "pendulum.png"
     assert size_of(drawn) == size_of(kept)

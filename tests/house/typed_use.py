@@ -172,6 +172,18 @@ def of_a_scene() -> float:
     return scene.error(times, sol.ys)
 
 
+def points(t: Array, q: Array) -> Array:
+    return q[None]
+
+
+def moving(sol: dae_jax.DAESolution) -> str:
+    drawing = scenes.Drawing(points, {"mass": 0}, down=True)
+    film: plotting.Animation = plotting.animate(drawing, sol, system=pendulum, speed=0.5, title="pendulum")
+    film.save("pendulum.gif", dpi=72)
+    sol.animate(drawing, system=pendulum).save("pendulum.html")
+    return film.html()
+
+
 def old_name() -> dae_jax.Reset:
     return dae_jax.Jump(condition, bounced)
 

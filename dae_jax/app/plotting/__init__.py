@@ -1,8 +1,10 @@
 """Figures. The only part that imports matplotlib, and only when a figure is drawn.
 
-Every function returns a `matplotlib.figure.Figure` and leaves pyplot's state alone. `curves` maps a label to (x, y).
+Every function returns a `matplotlib.figure.Figure` and leaves pyplot's state alone, `animate` an `Animation`. `curves` maps a
+label to (x, y).
 """
 
+from .animation import FILM_TYPES as FILM_TYPES, Animation as Animation, animate as animate
 from .common import FILE_TYPES as FILE_TYPES, METHODS as METHODS, look as look
 from .curves import (
     drift as drift,

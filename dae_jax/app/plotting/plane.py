@@ -1,11 +1,12 @@
-"""A plane mechanism and its paths."""
+"""A mechanism at a few times, and paths."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from .common import COLOURS, figure_around, legend_below, saved
+from .camera import Camera
+from .common import BLANK, COLOURS, GREY, figure_around, legend_below, saved
 
 
 def trajectory(times: np.ndarray, path: np.ndarray, first: float = 10.0, title: str = "") -> Any:
@@ -30,19 +31,25 @@ def mechanism(
     springs: Sequence[tuple[int, int]] = (),
     *,
     down: bool = False,
-    axes_labels: tuple[str, str] = ("x in m", "y in m"),
+    axes_labels: tuple[str, ...] = ("x in m", "y in m", "z in m"),
     title: str = "",
     shown: int = 6,
 ) -> Any:
-    """A plane mechanism at a few times, light to dark, and the paths of its masses.
+    """A mechanism at a few times, light to dark, and the paths of its masses.
 
-    `points` has the shape (times, points, 2); `masses` names those whose paths are drawn; `links` and `springs` are pairs
-    of points; `down`: whether the second coordinate points down. Points that stay where they are, are marked as pivots.
+    `points` has the shape (times, points, 2), or (times, points, 3) in space, seen in perspective; `masses` names those whose
+    paths are drawn; `links` and `springs` are pairs of points; `down`: whether the last coordinate points down. Points that
+    stay where they are, are marked as pivots.
     """
     from matplotlib.lines import Line2D
 
     times, points = np.asarray(times), np.asarray(points)
-    figure, axes = figure_around(points[..., 0], points[..., 1])
+    camera = None
+    if points.shape[2] == 3:
+        camera = Camera.around_motion(points, down)
+        points, down = camera(points)[..., :2], False
+    around = points.reshape(-1, 2) if camera is None else camera.around()
+    figure, axes = figure_around(around[:, 0], around[:, 1])
     paths, ends = [], []
     for i, (name, k) in enumerate(masses.items()):
         paths += axes.plot(*points[:, k].T, color=COLOURS[i % len(COLOURS)], linewidth=1, zorder=2, label=name)
@@ -61,9 +68,21 @@ def mechanism(
     still = [k for k in joined if np.ptp(points[:, k], axis=0).max() <= 1e-12]
     if still:
         paths += axes.plot(*points[0, still].T, "^", color="black", markersize=9, zorder=4, label="fixed")
-    axes.set(xlabel=axes_labels[0], ylabel=axes_labels[1])
+    if camera is None:
+        axes.set(xlabel=axes_labels[0], ylabel=axes_labels[1])
+    else:
+        draw_ground(axes, camera)
     axes.set_title(title, fontsize="medium")
     if down:
         axes.invert_yaxis()
     legend_below(figure, min(len(paths + ends), 4), paths + ends)
     return figure
+
+
+def draw_ground(axes: Any, camera: Camera) -> None:
+    """A grid on the ground in place of axes, and how wide its cells are."""
+    step, lines = camera.grid()
+    for line in lines[..., :2]:
+        axes.plot(*line.T, color=BLANK, linewidth=0.8, zorder=0)
+    axes.set_axis_off()
+    axes.text(0, 0, f"grid {step:g} m", transform=axes.transAxes, color=GREY, fontsize="small", va="bottom")
