@@ -236,7 +236,7 @@ _PID64, _PID32 = (diffrax.PIDController(rtol=tolerance, atol=tolerance) for tole
 
 def _raise_if_failed(sol: DAESolution, problem: Problem) -> DAESolution:
     if isinstance(sol.result._value, Tracer):
-        return raised_in_the_program(sol)
+        return raised_in_the_program(sol, problem)
     if int(sol.result._value) in OKAY:
         return sol
-    raise RuntimeError(" ".join([str(in_words(sol)), not_finite(*problem.start)]).strip())
+    raise RuntimeError(" ".join([str(in_words(sol, problem)), not_finite(*problem.start)]).strip())

@@ -12,8 +12,13 @@ from jax import lax
 from jaxtyping import Array, PyTree
 
 from .._compat import CALLBACK_LOG, messages, unvmap_any
+from ..consistent import Violation, violation
+from ..equations.mechanical import MechanicalODE
 from ..solution import RESULTS, DAESolution
+from ..systems import is_mechanism
 from ..types import BoolScalar
+from .problem import Problem
+from .start import ADVICE
 
 
 OKAY = tuple(int(code._value) for code in (RESULTS.successful, RESULTS.event_occurred))
@@ -27,22 +32,27 @@ class SolveFailed(RuntimeError):
     """A solve failed in a compiled program (`jit`, `vmap`). JAX hands it on as the last line of an error of its own."""
 
 
-def in_words(sol: DAESolution) -> str | None:
+def in_words(sol: DAESolution, problem: Problem) -> str | None:
     """Why a solve failed, at which time and after how many steps; `None` where it did not."""
-    return _sentence(*map(np.asarray, _details(sol)))
+    start = eqx.combine(lax.stop_gradient(eqx.filter(problem, eqx.is_array)), problem)
+    return _sentence(*map(np.asarray, lax.stop_gradient(_details(sol))), _off(start))
 
 
 def _details(sol: DAESolution) -> tuple[Any, ...]:
     return sol.result._value, sol.stats["end_time"], sol.t0, sol.t1, sol.stats["num_steps"]
 
 
-def _sentence(code: np.ndarray, end: np.ndarray, t0: np.ndarray, t1: np.ndarray, steps: np.ndarray) -> str | None:
-    """The sentence for numbers, or for arrays of a batch: that of the first of those that failed."""
+def _sentence(
+    code: np.ndarray, end: np.ndarray, t0: np.ndarray, t1: np.ndarray, steps: np.ndarray, off: Violation | None = None
+) -> str | None:
+    """The sentence for numbers, or for arrays of a batch: that of the first of those that failed. `off`: from its constraints."""
     failed = np.flatnonzero(~np.isin(code, OKAY))
     if not failed.size:
         return None
     at = lambda x: np.broadcast_to(x, np.shape(code)).reshape(-1)[failed[0]]
     said = messages(RESULTS)[int(at(code))]
+    if off is not None and int(at(code)) == int(RESULTS.inconsistent_start._value):
+        said = _of_one(off, failed[0], np.ndim(code)).message() + ADVICE
     if int(at(code)) not in _AT_START:
         said += f" The solve from t = {at(t0):.6g} to {at(t1):.6g} ended at t = {at(end):.6g} after {at(steps)} steps."
     if np.asarray(t0).dtype == np.float32:
@@ -57,31 +67,47 @@ def _sentence(code: np.ndarray, end: np.ndarray, t0: np.ndarray, t1: np.ndarray,
     return said
 
 
-def raised_in_the_program(sol: DAESolution) -> DAESolution:
-    """`sol`, in a program in which it raises a `SolveFailed` where it is evaluated and has failed."""
+def _of_one(off: Violation, number: int, axes: int) -> Violation:
+    """That of one of a batch of so many axes, in each of which an array may be of length 1."""
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[axes:])[number if x.shape[:axes] != (1,) * axes else 0], off)
+
+
+def raised_in_the_program(sol: DAESolution, problem: Problem) -> DAESolution:
+    """`sol` of a problem, in a program in which it raises a `SolveFailed` where it is evaluated and has failed."""
     okay = jnp.any(jnp.stack([sol.result._value == code for code in OKAY]))
     arrays, rest = eqx.partition(sol, eqx.is_array)
     details = jax.tree.map(jnp.asarray, lax.stop_gradient(_details(sol)))
-    return eqx.combine(_passed(arrays, ~okay, details), rest)
+    start = lax.stop_gradient(eqx.filter(problem, eqx.is_array)), eqx.filter(problem, eqx.is_array, inverse=True)
+    return eqx.combine(_passed(arrays, ~okay, details, start), rest)
 
 
-# A custom derivative, so that the branch is none in a derivative.
+# A custom derivative, so that the branch is none in a derivative, which fails where the solve does also if only it is asked for.
 @eqx.filter_custom_jvp
-def _passed(arrays: PyTree[Array], failed: BoolScalar, details: tuple[Array, ...]) -> Any:
+def _passed(arrays: PyTree[Array], failed: BoolScalar, details: tuple[Array, ...], start: tuple[PyTree, PyTree]) -> Any:
     shapes = jax.eval_shape(lambda: arrays)
-    fail = lambda: jax.pure_callback(_raise, shapes, *details, vmap_method="expand_dims")
+    fail = lambda: jax.pure_callback(_raise, shapes, _off(eqx.combine(*start)), *details, vmap_method="expand_dims")
     return lax.cond(unvmap_any(failed), fail, lambda: arrays)
 
 
 @_passed.def_jvp
 def _(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
-    return _passed(*primals), tangents[0]
+    one = _passed(jnp.ones(()), *primals[1:])
+    return _passed(*primals), jax.tree.map(lambda tangent: tangent * one.astype(tangent.dtype), tangents[0])
 
 
-def _raise(*details: Array | np.ndarray) -> Any:
+def _off(problem: Problem) -> Violation | None:
+    """By how much a mechanism violates its constraints at the start: worth to be computed only where a solve has failed."""
+    system, t, state, args = problem.start
+    if not is_mechanism(system):
+        return None
+    ode = MechanicalODE.of(system, t, state, args, problem.rank)
+    return jax.tree.map(jnp.asarray, violation(ode, t, ode.encode(state)))
+
+
+def _raise(off: Violation | None, *details: Array | np.ndarray) -> Any:
     # JAX would print the traceback of this function before the error that has it.
     logging.getLogger(CALLBACK_LOG).addFilter(_without_ours)
-    raise SolveFailed(_sentence(*map(np.asarray, details)))
+    raise SolveFailed(_sentence(*map(np.asarray, details), off))
 
 
 def _without_ours(record: logging.LogRecord) -> bool:

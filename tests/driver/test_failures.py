@@ -1,0 +1,60 @@
+"""A solve that fails says so wherever it is asked for: outside and inside `jit`, in batches, and where only its derivative is used."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import pytest
+
+import dae_jax
+
+
+ARMS = dae_jax.ConstrainedSystem(
+    lambda t, q, v, args: jnp.array([0.0, -9.81, 0.0, -9.81]),
+    lambda t, q, args: jnp.stack([(q[:2] @ q[:2] - 1) / 2, (q[2:] @ q[2:] - 1) / 2]),
+)
+GOOD = jnp.array([1.0, 0.0, 0.0, 1.0])
+BAD = GOOD.at[3].set(1.1)
+METHODS = {
+    "projection": (dae_jax.OrthogonalProjection(dae_jax.DOP853()), diffrax.RecursiveCheckpointAdjoint()),
+    "forwards": (dae_jax.OrthogonalProjection(dae_jax.DOP853()), diffrax.ForwardMode()),
+}
+# What is asked for, as a function of the end of the solve as a function of q.
+ASKED = {
+    "value": lambda end: end,
+    "jit": lambda end: jax.jit(end),
+    "vmap": lambda end: lambda q: jax.vmap(end)(jnp.stack([GOOD, q])),
+    "vmap of vmap": lambda end: lambda q: jax.vmap(jax.vmap(end))(jnp.stack([jnp.stack([GOOD, q])] * 3)),
+    "directional derivative": lambda end: lambda q: jax.jvp(end, (q,), (q,)),
+    "jit of a directional derivative alone": lambda end: jax.jit(lambda q: jax.jvp(end, (q,), (q,))[1]),
+    "gradient": lambda end: jax.grad(end),
+    "jit of a gradient": lambda end: jax.jit(jax.grad(end)),
+    "vmap of a gradient": lambda end: lambda q: jax.jit(jax.vmap(jax.grad(end)))(jnp.stack([GOOD, q])),
+}
+
+
+def end_of(method, **options):
+    solver, adjoint = METHODS[method]
+    return lambda q: dae_jax.daesolve(
+        ARMS, solver, 0.0, 1.0, None, (q, jnp.zeros(4)), adjoint=adjoint, **options
+    ).ys[0].sum()  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("method", "asked"),
+    [(method, asked) for method in METHODS for asked in ASKED if method == "projection" or "gradient" not in asked],
+)
+class TestFails:
+    def test_at_a_bad_start_in_the_name_of_the_constraint(self, method, asked):
+        with pytest.raises(
+            (ValueError, RuntimeError), match=r"position level: 0 = constraint\[1\] \(g\) is off by 0\.105"
+        ):
+            jax.block_until_ready(ASKED[asked](end_of(method))(BAD))
+
+    def test_after_too_many_steps(self, method, asked):
+        with pytest.raises(RuntimeError, match="maximum number of"):
+            jax.block_until_ready(ASKED[asked](end_of(method, max_steps=3))(GOOD))
+
+
+def test_a_derivative_of_a_solve_that_goes_well_is_as_without_the_check():
+    both = [jax.jit(jax.grad(end_of("projection", throw=throw)))(GOOD) for throw in (True, False)]
+    assert jnp.array_equal(*both)
