@@ -35,17 +35,18 @@ class SolveFailed(RuntimeError):
 def in_words(sol: DAESolution, problem: Problem) -> str | None:
     """Why a solve failed, at which time and after how many steps; `None` where it did not."""
     start = eqx.combine(lax.stop_gradient(eqx.filter(problem, eqx.is_array)), problem)
-    return _sentence(*map(np.asarray, lax.stop_gradient(_details(sol))), _off(start))
+    return _sentence(tuple(map(np.asarray, lax.stop_gradient(_details(sol)))), _off(start))
 
 
 def _details(sol: DAESolution) -> tuple[Any, ...]:
     return sol.result._value, sol.stats["end_time"], sol.t0, sol.t1, sol.stats["num_steps"]
 
 
-def _sentence(
-    code: np.ndarray, end: np.ndarray, t0: np.ndarray, t1: np.ndarray, steps: np.ndarray, off: Violation | None = None
-) -> str | None:
-    """The sentence for numbers, or for arrays of a batch: that of the first of those that failed. `off`: from its constraints."""
+def _sentence(details: tuple[np.ndarray, ...], off: Violation | None) -> str | None:
+    """The sentence for numbers, or for arrays of a batch: that of the first of those that failed; `off`: how far its start is from
+    the constraints.
+    """
+    code, end, t0, t1, steps = details
     failed = np.flatnonzero(~np.isin(code, OKAY))
     if not failed.size:
         return None
@@ -107,7 +108,7 @@ def _off(problem: Problem) -> Violation | None:
 def _raise(off: Violation | None, *details: Array | np.ndarray) -> Any:
     # JAX would print the traceback of this function before the error that has it.
     logging.getLogger(CALLBACK_LOG).addFilter(_without_ours)
-    raise SolveFailed(_sentence(*map(np.asarray, details), off))
+    raise SolveFailed(_sentence(tuple(map(np.asarray, details)), off))
 
 
 def _without_ours(record: logging.LogRecord) -> bool:
