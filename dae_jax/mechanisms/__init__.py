@@ -1,0 +1,31 @@
+"""Mechanisms as people have them: bodies, joints and loads, in the plane and in space, as a `ConstrainedSystem`."""
+
+from .bodies import Body as Body, Ground as Ground, ground as ground
+from .configuration import Coordinate as Coordinate, Coordinates as Coordinates
+from .contacts import (
+    between as between,
+    distance as distance,
+    point_on_curve as point_on_curve,
+    rolling as rolling,
+)
+from .joints import (
+    AbstractJoint as AbstractJoint,
+    cylindrical as cylindrical,
+    fixed as fixed,
+    planar as planar,
+    prismatic as prismatic,
+    revolute as revolute,
+    spherical as spherical,
+    universal as universal,
+)
+from .loads import (
+    AbstractLoad as AbstractLoad,
+    damper as damper,
+    force as force,
+    friction as friction,
+    gravity as gravity,
+    motor as motor,
+    spring as spring,
+    torque as torque,
+)
+from .mechanism import Mechanism as Mechanism
