@@ -46,7 +46,10 @@ def assembled(
         scale = 1 + float(jnp.max(jnp.abs(start[0].values)))
         if max(open_by.values(), default=0.0) <= CLOSED * scale:
             # The guess was too far off for Newton's method, and its positions are not: from those closed ones it converges.
-            return consistent_state(system, t0, (nearest, start[1]), args)
+            try:
+                return consistent_state(system, t0, (nearest, start[1]), args)
+            except ValueError:
+                raise ValueError(_message({}, 0.0)) from refusal
         raise ValueError(_message(open_by, CLOSED * scale)) from refusal
 
 
@@ -182,7 +185,10 @@ def _closing(mechanism: "Mechanism") -> list[str]:
 def _message(gaps: dict[str, float], allowed: float) -> str:
     still_open = sorted(((gap, name) for name, gap in gaps.items() if gap > allowed), reverse=True)
     if not still_open:
-        return "No consistent state was found: the values in `at` and `rates` contradict the joints."
+        return (
+            "All joints close, but no velocities fit them: the values in `rates` contradict the joints (of a mechanism that cannot "
+            "move they are 0), or a motor moves what cannot move."
+        )
     gap, worst = still_open[0]
     others = "".join(f"\n  {name!r} by {gap:.6g}" for gap, name in still_open[1:])
     return (

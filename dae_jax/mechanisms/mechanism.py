@@ -103,13 +103,10 @@ class Mechanism(eqx.Module):
         return sum(parts, jnp.zeros((), q.values.dtype))
 
     def mass(self, q: Coordinates, args: Args = None) -> Float[Array, "..."]:
-        """M: its diagonal in the plane, (n, n) in space."""
+        """M: its diagonal in the plane, its blocks (bodies, 7, 7) in space."""
         at = self.configuration(q)
         blocks = jax.vmap(mass_block)(at.masses, at.inertias, q.values)
-        if self.dimension == 2:
-            return jnp.ravel(blocks)
-        n, apart = q.values.size, jnp.eye(len(self.bodies))
-        return jnp.reshape(apart[:, None, :, None] * blocks[:, :, None, :], (n, n))
+        return jnp.ravel(blocks) if self.dimension == 2 else blocks
 
     def system(self, rank: int | tuple[int, int] | None = None) -> ConstrainedSystem:
         """The equations as `daesolve` takes them; `rank` as that of `ConstrainedSystem`, which only a start that is traced needs
