@@ -4,6 +4,7 @@ from .bodies import Body as Body, Ground as Ground, ground as ground
 from .configuration import Coordinate as Coordinate, Coordinates as Coordinates
 from .contacts import (
     between as between,
+    coupling as coupling,
     distance as distance,
     point_on_curve as point_on_curve,
     rolling as rolling,
@@ -29,3 +30,4 @@ from .loads import (
     torque as torque,
 )
 from .mechanism import Mechanism as Mechanism
+from .mjcf import read_mjcf as read_mjcf

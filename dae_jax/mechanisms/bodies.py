@@ -244,7 +244,7 @@ def _refuse_no_mass(body: Body) -> None:
     if isinstance(body.inertia, Tracer):
         return
     j = np.atleast_2d(np.asarray(body.inertia))
-    if not (np.allclose(j, j.T, rtol=1e-6, atol=0) and np.linalg.eigvalsh(j)[0] > 0):
+    if not (np.allclose(j, j.T, rtol=0, atol=1e-6 * np.abs(j).max()) and np.linalg.eigvalsh(j)[0] > 0):
         raise ValueError(
             f"Body {body.name!r} has the inertia {np.asarray(body.inertia).tolist()}, and must have one that is positive "
             "(symmetric, with positive principal moments); give a thin rod a little about its axis."

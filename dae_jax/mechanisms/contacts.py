@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from ..types import Args, Time
 from .bodies import Numbers, numbers, reference_pose
 from .configuration import Configuration, Coordinate, Kind, Marker
-from .joints import AbstractJoint, Part, Points, dimension_of, frame_along, label_of, markers, unit
+from .joints import AbstractJoint, Part, Points, dimension_of, frame_along, label_of, markers, only_coordinate, unit
 
 
 class Distance(AbstractJoint):
@@ -124,6 +124,56 @@ class Motion(AbstractJoint):
     @property
     def coordinates(self) -> dict[Kind, Coordinate]:
         return {self.coordinate.kind: self.coordinate}
+
+
+class Coupling(AbstractJoint):
+    """Two coordinates that go together, c₁ = Σ aₖ c₂ᵏ: a gear, a rack, a screw. Of an angle in space it is the sine of the difference
+    that is 0: turns do not count, where c₂ is an angle too if a₁ is a whole number.
+    """
+
+    name: str = eqx.field(static=True)
+    first: Coordinate
+    second: Coordinate | None
+    coefficients: Float[Array, " k"]
+
+    @property
+    def on_a(self) -> Marker:
+        return self.first.on_a
+
+    @property
+    def on_b(self) -> Marker:
+        return self.first.on_b
+
+    def constraint(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
+        other = jnp.zeros(()) if self.second is None else self.second(at)
+        off = self.first(at) - jnp.polyval(self.coefficients[::-1], other)
+        return (jnp.sin(off) if self.first.kind == "angle" and at.dimension == 3 else off)[None]
+
+    def nonholonomic(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
+        return jnp.zeros(0)
+
+    @property
+    def coordinates(self) -> dict[Kind, Coordinate]:
+        return {}
+
+
+def coupling(
+    first: AbstractJoint | Coordinate,
+    second: AbstractJoint | Coordinate | None,
+    coefficients: Numbers,
+    *,
+    name: str | None = None,
+) -> Coupling:
+    """Two coordinates that go together, c₁ = Σ aₖ c₂ᵏ, or one that is held, c₁ = a₀.
+
+    **Arguments**
+
+    - `first`, `second`: joints with one coordinate, or their coordinates.
+    - `coefficients`: (a₀, a₁, ...): (0, −2) is a gear of ratio 2 that turns the other way.
+    """
+    one, two = only_coordinate(first), None if second is None else only_coordinate(second)
+    label = f"coupling of {one.name}" if name is None else name
+    return Coupling(label, one, two, jnp.atleast_1d(numbers(coefficients)))
 
 
 def distance(

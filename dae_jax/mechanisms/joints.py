@@ -130,6 +130,19 @@ def pairs(joints: Sequence[Joint], at: Configuration) -> Float[Array, " m"]:
     return jnp.ravel(every)[np.array(chosen)]
 
 
+def only_coordinate(on: AbstractJoint | Coordinate) -> Coordinate:
+    """That of a joint which has one, or itself."""
+    if isinstance(on, Coordinate):
+        return on
+    found = on.coordinates
+    if len(found) != 1:
+        has = " and ".join(f"`joint.{kind}`" for kind in found)
+        raise ValueError(
+            f"Joint {on.name!r} has " + (f"{has}: say which." if found else "no coordinate that a load could act along.")
+        )
+    return next(iter(found.values()))
+
+
 def revolute(
     a: Part,
     b: Part,

@@ -18,7 +18,7 @@ from ..types import Args, Scalar, Time
 from .bodies import Body, Numbers, generalised, numbers, pose
 from .configuration import Configuration, Coordinate, MarkerArrays, value
 from .contacts import Motion
-from .joints import AbstractJoint
+from .joints import AbstractJoint, only_coordinate
 from .rotations import rotate
 
 
@@ -190,12 +190,12 @@ def spring(
     - `stiffness`: k, in N/m or N m/rad.
     - `rest`: c₀, in m or rad.
     """
-    return Along(_named("spring", on, name), _coordinate(on), Spring(numbers(stiffness), numbers(rest)))
+    return Along(_named("spring", on, name), only_coordinate(on), Spring(numbers(stiffness), numbers(rest)))
 
 
 def damper(on: AbstractJoint | Coordinate, damping: Numbers, *, name: str | None = None) -> Along:
     """A linear damper, τ = −d ċ, with d in N s/m or N m s. `on` is as that of `spring`."""
-    return Along(_named("damper", on, name), _coordinate(on), Friction(numbers(damping), None, jnp.ones(())))
+    return Along(_named("damper", on, name), only_coordinate(on), Friction(numbers(damping), None, jnp.ones(())))
 
 
 def friction(
@@ -216,7 +216,7 @@ def friction(
     - `smoothing`: ε, in rad/s or m/s: below this speed dry friction creeps, where in truth it sticks. The smaller, the stiffer.
     """
     law = Friction(numbers(viscous), numbers(coulomb), numbers(smoothing))
-    return Along(_named("friction", on, name), _coordinate(on), law)
+    return Along(_named("friction", on, name), only_coordinate(on), law)
 
 
 def motor(
@@ -240,9 +240,9 @@ def motor(
     if (torque is None) == (motion is None):
         raise ValueError(f"Motor {label!r} needs either a `torque` or a `motion`.")
     if motion is not None:
-        return Motion(label, _coordinate(on), motion)
+        return Motion(label, only_coordinate(on), motion)
     assert torque is not None
-    return Along(label, _coordinate(on), Drive(torque if callable(torque) else numbers(torque)))
+    return Along(label, only_coordinate(on), Drive(torque if callable(torque) else numbers(torque)))
 
 
 def force(
@@ -276,18 +276,6 @@ def torque(
     """A moment on a body, a number in N m in the plane, (3,) in space, or `value(t, q, v, args)`. Other arguments as those of `force`."""
     zero = jnp.zeros(body.dimension)
     return Applied(name or f"torque on {body.name}", body.name, "torque", axes, _value(value), zero)
-
-
-def _coordinate(on: AbstractJoint | Coordinate) -> Coordinate:
-    if isinstance(on, Coordinate):
-        return on
-    found = on.coordinates
-    if len(found) != 1:
-        has = " and ".join(f"`joint.{kind}`" for kind in found)
-        raise ValueError(
-            f"Joint {on.name!r} has " + (f"{has}: say which." if found else "no coordinate that a load could act along.")
-        )
-    return next(iter(found.values()))
 
 
 def _named(kind: str, on: AbstractJoint | Coordinate, name: str | None) -> str:

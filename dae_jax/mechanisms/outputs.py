@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Literal
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -12,7 +13,7 @@ from ..solution import DAESolution, without_padding
 from ..types import Args, Time
 from .bodies import GROUND, wrench
 from .configuration import Configuration, Coordinate
-from .contacts import Motion
+from .contacts import Coupling, Motion
 from .joints import AbstractJoint
 from .loads import AbstractLoad, Along, Applied
 from .rotations import moment, rotate_back
@@ -26,8 +27,10 @@ def bodies_of(element: AbstractJoint | AbstractLoad) -> set[str]:
     """The bodies that a joint or a load names."""
     if isinstance(element, Applied):
         return {element.body}
-    on = element.coordinate if isinstance(element, Along) else element
-    return {on.on_a.body, on.on_b.body} if isinstance(on, AbstractJoint | Coordinate) else set()
+    on = [element.coordinate if isinstance(element, Along) else element]
+    if isinstance(element, Coupling) and element.second is not None:
+        on.append(element.second)
+    return {x.body for part in on if isinstance(part, AbstractJoint | Coordinate) for x in (part.on_a, part.on_b)}
 
 
 def coordinate_named(mechanism: "Mechanism", name: str) -> Coordinate:
@@ -103,7 +106,7 @@ def reaction(
         return force, torque
 
     ts, ys = without_padding(sol.ts, sol.ys)
-    return jax.vmap(lambda t, y, lam, mu: at_one(t, y, lam, mu, sol.args))(ts, ys, lam, mu)
+    return _mapped(at_one, (ts, ys, lam, mu), sol.args)
 
 
 def energy(mechanism: "Mechanism", sol: DAESolution) -> Float[Array, " times"]:
@@ -137,5 +140,10 @@ def _at_saved_times(
     mechanism: "Mechanism", sol: DAESolution, of: Callable[[Time, Configuration, Args], Array]
 ) -> Float[Array, " times"]:
     """of(t, configuration, args) at each saved time."""
-    at_one = lambda t, y: of(t, mechanism.configuration(*y), sol.args)
-    return jax.vmap(at_one)(*without_padding(sol.ts, sol.ys))
+    return _mapped(lambda t, y, args: of(t, mechanism.configuration(*y), args), without_padding(sol.ts, sol.ys), sol.args)
+
+
+@eqx.filter_jit
+def _mapped(of: Callable[..., Any], over: tuple[Any, ...], args: Args) -> Any:
+    """of(*row, args) for each row."""
+    return jax.vmap(lambda *row: of(*row, args))(*over)
