@@ -9,6 +9,11 @@ from .contacts import (
     point_on_curve as point_on_curve,
     rolling as rolling,
 )
+from .examples import (
+    five_bar as five_bar,
+    five_bar_linkage as five_bar_linkage,
+    stewart_platform as stewart_platform,
+)
 from .joints import (
     AbstractJoint as AbstractJoint,
     cylindrical as cylindrical,

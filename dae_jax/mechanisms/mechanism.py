@@ -8,12 +8,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..scenes.scene import Drawing
 from ..solution import DAESolution
 from ..systems import ConstrainedSystem
 from ..types import Args, Scalar, Time
 from . import assembly, outputs
 from .bodies import GROUND, Body, inertial_force, mass_block
 from .configuration import Configuration, Coordinates
+from .drawing import drawing
 from .joints import AbstractJoint, Joint, pairs
 from .loads import AbstractLoad, Along, along
 
@@ -205,6 +207,10 @@ class Mechanism(eqx.Module):
         those of least norm of the multipliers are given.
         """
         return outputs.reaction(self, sol, name, axes)
+
+    def drawing(self) -> Drawing:
+        """Centres of mass, joints and springs as points, (points, 2) or (points, 3), and the lines between them."""
+        return drawing(self)
 
     def energy(self, sol: DAESolution) -> Float[Array, " times"]:
         """Kinetic and potential energy, in J."""
