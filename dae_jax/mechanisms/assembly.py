@@ -53,9 +53,7 @@ def assembled(
         raise ValueError(_message(open_by, CLOSED * scale)) from refusal
 
 
-def rank(
-    mechanism: "Mechanism", y0: tuple[Coordinates, Coordinates], t0: Time, args: Args
-) -> tuple[int, int]:
+def rank(mechanism: "Mechanism", y0: tuple[Coordinates, Coordinates], t0: Time, args: Args) -> tuple[int, int]:
     """The numerical rank of the constraints' Jacobians, rows scaled to length 1."""
     (q, v), system = y0, mechanism.system()
     flat_q, of_q = ravel_pytree(q)
@@ -90,13 +88,17 @@ def _start(mechanism: "Mechanism", guess: Any) -> tuple[Coordinates, Coordinates
                 raise ValueError(f"`guess` has {what} of {name!r}, which is no body; bodies are {', '.join(known)}.")
             if row.shape != found_so_far[name].shape:
                 count = len(found_so_far[name])
-                raise ValueError(f"`guess`: the {what} of {name!r} must be {count} numbers, but have the shape {row.shape}.")
+                raise ValueError(
+                    f"`guess`: the {what} of {name!r} must be {count} numbers, but have the shape {row.shape}."
+                )
             found_so_far = found_so_far.put(name, row)
         found.append(found_so_far)
     return found[0], found[1]
 
 
-def _with_values(mechanism: "Mechanism", at: Mapping[str, Any], rates: Mapping[str, Any], t0: Time) -> ConstrainedSystem:
+def _with_values(
+    mechanism: "Mechanism", at: Mapping[str, Any], rates: Mapping[str, Any], t0: Time
+) -> ConstrainedSystem:
     """The mechanism's equations and those that fix values of coordinates and rates."""
     system = mechanism.system()
     if not at and not rates:
@@ -108,7 +110,8 @@ def _with_values(mechanism: "Mechanism", at: Mapping[str, Any], rates: Mapping[s
         if c.kind == "angle" and mechanism.dimension == 3:
             sine, cosine = c.direction(configuration)
             return jnp.arctan2(
-                sine * jnp.cos(at[name]) - cosine * jnp.sin(at[name]), cosine * jnp.cos(at[name]) + sine * jnp.sin(at[name])
+                sine * jnp.cos(at[name]) - cosine * jnp.sin(at[name]),
+                cosine * jnp.cos(at[name]) + sine * jnp.sin(at[name]),
             )
         return c(configuration) - at[name]
 
@@ -141,9 +144,10 @@ def _gaps(
     from scipy.optimize import least_squares
 
     flat, unflatten = ravel_pytree(start[0])
-    if system.constraint is None:
+    constraint = system.constraint
+    if constraint is None:
         return {}, start[0]
-    g = jax.jit(lambda x: jnp.ravel(system.constraint(t0, unflatten(x), args)))
+    g = jax.jit(lambda x: jnp.ravel(constraint(t0, unflatten(x), args)))
     slope = jax.jit(jax.jacfwd(g))
     rows, closing = mechanism.rows(), _closing(mechanism)
     weights = np.full(g(flat).shape[0], TREE)
@@ -152,7 +156,7 @@ def _gaps(
     found = least_squares(
         lambda x: weights * np.asarray(g(x)),
         np.asarray(flat),
-        lambda x: weights[:, None] * np.asarray(slope(x)),
+        lambda x: weights[:, None] * np.asarray(slope(x)),  # pyright: ignore[reportArgumentType]
         method="trf",
         xtol=1e-15,
         ftol=1e-15,

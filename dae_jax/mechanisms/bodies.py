@@ -194,9 +194,7 @@ def mass_block(mass: Float[Array, ""], inertia: Float[Array, "..."], q: Float[Ar
     )
 
 
-def inertial_force(
-    inertia: Float[Array, "..."], q: Float[Array, " k"], v: Float[Array, " k"]
-) -> Float[Array, " k"]:
+def inertial_force(inertia: Float[Array, "..."], q: Float[Array, " k"], v: Float[Array, " k"]) -> Float[Array, " k"]:
     """∂T/∂q − Ṁ v."""
     if dimension(q) == 2:
         return jnp.zeros_like(q)

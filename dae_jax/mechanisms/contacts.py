@@ -173,7 +173,8 @@ def coupling(
     """
     one, two = only_coordinate(first), None if second is None else only_coordinate(second)
     label = f"coupling of {one.name}" if name is None else name
-    return Coupling(label, one, two, jnp.atleast_1d(numbers(coefficients)))
+    # Its markers, fields of other joints, are those of its first coordinate.
+    return Coupling(label, one, two, jnp.atleast_1d(numbers(coefficients)))  # pyright: ignore[reportCallIssue]
 
 
 def distance(

@@ -33,7 +33,9 @@ class Points(eqx.Module):
 def drawing(mechanism: "Mechanism") -> Drawing:
     """Each body as lines from its centre of mass to its joints (through it, where there are two), springs between their ends."""
     names = [body.name for body in mechanism.bodies]
-    springs = [load.coordinate for load in mechanism.loads if isinstance(load, Along) and load.coordinate.kind == "distance"]
+    springs = [
+        load.coordinate for load in mechanism.loads if isinstance(load, Along) and load.coordinate.kind == "distance"
+    ]
     markers = [marker for x in (*mechanism.joints, *springs) for marker in (x.on_a, x.on_b)]
     at = lambda k: len(names) + k
     links = {(names.index(marker.body), at(k)) for k, marker in enumerate(markers) if marker.body != GROUND}

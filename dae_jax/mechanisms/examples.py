@@ -1,14 +1,16 @@
 """Ready mechanisms, as scenes: a five-bar linkage with a motor, and a Stewart platform with six loops."""
 
+from typing import cast
+
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from ..scenes.scene import Scene, State, minimal
 from ..systems import ConstrainedSystem
 from .bodies import Body, ground
 from .configuration import Coordinates
-from .joints import prismatic, revolute, spherical, universal
-from .loads import damper, gravity, motor, spring
+from .joints import AbstractJoint, prismatic, revolute, spherical, universal
+from .loads import AbstractLoad, damper, gravity, motor, spring
 from .mechanism import Mechanism
 
 
@@ -24,7 +26,7 @@ def five_bar_linkage() -> Mechanism:
     """Two cranks on the ground and two couplers that meet, slender rods in the plane; a motor with a constant torque on the left
     crank, and gravity.
     """
-    places = _five_bar(np.array([2.0, 1.0])).real.reshape(4, 3)
+    places = np.real(_five_bar(np.array([2.0, 1.0]))).reshape(4, 3)
     inertias = MASSES * LENGTHS**2 / 12
     bars = [
         Body(name, mass, inertia, at=place[:2], orientation=place[2])
@@ -51,7 +53,7 @@ def five_bar() -> Scene[ConstrainedSystem]:
     force = np.stack([0 * MASSES, -9.81 * MASSES, 0 * MASSES], 1).ravel()
 
     def slopes(z: np.ndarray) -> Float[np.ndarray, "12 2"]:
-        return np.stack([_five_bar(z + 1e-30j * unit).imag / 1e-30 for unit in np.eye(2)], 1)
+        return np.stack([np.imag(_five_bar(z + 1e-30j * unit)) / 1e-30 for unit in np.eye(2)], 1)
 
     def field(t: float, z: np.ndarray) -> np.ndarray:
         angles, rates = z[:2], z[2:]
@@ -63,17 +65,22 @@ def five_bar() -> Scene[ConstrainedSystem]:
         return np.concatenate([rates, np.linalg.solve(j.T @ (weights[:, None] * j), right)])
 
     def embed(t: float, z: np.ndarray) -> State:
-        return _five_bar(z[:2]).real, slopes(z[:2]) @ z[2:]
+        return np.real(_five_bar(z[:2])), slopes(z[:2]) @ z[2:]
 
     solved = minimal(field, [2.0, 1.0, 0.0, 0.0], embed)
 
     def reference(times: np.ndarray) -> tuple[Coordinates, Coordinates]:
         q, v = (x.reshape(-1, 4, 3) for x in solved(times))
-        return Coordinates(q, BARS), Coordinates(v, BARS)
+        return _bars(q), _bars(v)
 
-    q, v = mechanism.reference
-    y0 = (Coordinates(np.asarray(q.values), BARS), Coordinates(np.asarray(v.values), BARS))
+    q, v = (np.asarray(x.values) for x in mechanism.reference)
+    y0 = (_bars(q), _bars(v))
     return Scene("five-bar", mechanism.system(), y0, 0.6, reference, drawing=mechanism.drawing())
+
+
+def _bars(values: Float[np.ndarray, "*times 4 3"]) -> Coordinates:
+    # A scene's states are arrays of numpy.
+    return Coordinates(cast(Array, values), BARS)
 
 
 def _five_bar(z: np.ndarray) -> np.ndarray:
@@ -101,7 +108,8 @@ def stewart_platform(stiffness: float = 2000.0, damping: float = 0.0) -> Mechani
     base = ring(np.array([20.0, 100, 140, 220, 260, 340]), 1.0, 0.0)
     top = ring(np.array([40.0, 80, 160, 200, 280, 320]), 0.6, 1.0)
     platform = Body("platform", 10.0, (0.9, 1.0, 1.7), at=(0, 0, 1), velocity=(0.2, 0.1, 0.0), spin=(0.1, 0.2, 0.5))
-    bodies, joints, loads = [platform], [], [gravity((0, 0, -9.81))]
+    bodies, joints = [platform], []
+    loads: list[AbstractLoad | AbstractJoint] = [gravity((0, 0, -9.81))]
     for k, (foot, head) in enumerate(zip(base, top, strict=True)):
         along = (head - foot) / np.linalg.norm(head - foot)
         side = np.cross(along, (0, 0, 1)) / np.linalg.norm(np.cross(along, (0, 0, 1)))

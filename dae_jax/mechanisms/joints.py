@@ -121,10 +121,12 @@ def pairs(joints: Sequence[Joint], at: Configuration) -> Float[Array, " m"]:
     (p_a, axes_a, turned_a), (p_b, axes_b, turned_b) = sides
     apart = p_b - p_a
     along = jnp.sum(axes_a * apart[:, :, None], 1)
-    if d == 2:
-        turns = (turned_b - turned_a)[:, None]
-    else:
-        turns = jnp.sum(axes_a[:, :, :, None] * axes_b[:, :, None, :], 1).reshape(-1, 9)
+    # In the plane the angle, whose turns axes do not show.
+    turns = (
+        (turned_b - turned_a)[:, None]
+        if d == 2
+        else jnp.sum(axes_a[:, :, :, None] * axes_b[:, :, None, :], 1).reshape(-1, 9)
+    )
     every = jnp.concatenate([apart, along, turns], 1)
     chosen = [k * every.shape[1] + i for k, joint in enumerate(joints) for i in joint.columns]
     return jnp.ravel(every)[np.array(chosen)]
@@ -138,7 +140,8 @@ def only_coordinate(on: AbstractJoint | Coordinate) -> Coordinate:
     if len(found) != 1:
         has = " and ".join(f"`joint.{kind}`" for kind in found)
         raise ValueError(
-            f"Joint {on.name!r} has " + (f"{has}: say which." if found else "no coordinate that a load could act along.")
+            f"Joint {on.name!r} has "
+            + (f"{has}: say which." if found else "no coordinate that a load could act along.")
         )
     return next(iter(found.values()))
 
@@ -288,7 +291,9 @@ def markers(
     """Those of a joint on a and b, from a point in the world or from a point of each."""
     d = dimension_of(a, b)
     if (at is None) == (anchors is None):
-        raise ValueError(f"Joint {label!r}: give either `at`, a point in the world, or `anchors`, a point of each body.")
+        raise ValueError(
+            f"Joint {label!r}: give either `at`, a point in the world, or `anchors`, a point of each body."
+        )
     axes = jnp.eye(d) if axes is None else axes
     if anchors is None:
         assert at is not None
@@ -306,7 +311,9 @@ def dimension_of(a: Part, b: Part) -> Literal[2, 3]:
     found = {body.dimension for body in (a, b) if isinstance(body, Body)}
     if len(found) != 1:
         what = "one is planar and one is spatial" if found else "neither moves"
-        raise ValueError(f"A joint needs two bodies of one kind, or a body and the ground; of {a.name!r} and {b.name!r} {what}.")
+        raise ValueError(
+            f"A joint needs two bodies of one kind, or a body and the ground; of {a.name!r} and {b.name!r} {what}."
+        )
     return 2 if found == {2} else 3
 
 

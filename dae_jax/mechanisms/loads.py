@@ -134,9 +134,9 @@ def along(loads: Sequence[Along], t: Time, at: Configuration, args: Args) -> Flo
     on_a, on_b = (jax.tree.map(lambda *x: jnp.stack(x), *(marker.arrays for marker in on)) for on in ends)
 
     def one(q: Pair, v: Pair, on: tuple[MarkerArrays, MarkerArrays]) -> tuple[Scalar, Scalar, Pair]:
-        c = lambda q: value(kind, *q, *on)
+        c = lambda q: value(kind, q[0], q[1], on[0], on[1])
         slope = jax.grad(c)(q)
-        return c(q), sum(jnp.sum(s * x) for s, x in zip(slope, v, strict=True)), slope
+        return c(q), jnp.sum(slope[0] * v[0]) + jnp.sum(slope[1] * v[1]), slope
 
     u, q = at.velocities, at.rows
     c, rate, slopes = jax.vmap(one)((q[a], q[b]), (u[a], u[b]), (on_a, on_b))
@@ -240,7 +240,8 @@ def motor(
     if (torque is None) == (motion is None):
         raise ValueError(f"Motor {label!r} needs either a `torque` or a `motion`.")
     if motion is not None:
-        return Motion(label, only_coordinate(on), motion)
+        # Its markers, fields of other joints, are those of its coordinate.
+        return Motion(label, only_coordinate(on), motion)  # pyright: ignore[reportCallIssue]
     assert torque is not None
     return Along(label, only_coordinate(on), Drive(torque if callable(torque) else numbers(torque)))
 
@@ -284,4 +285,3 @@ def _named(kind: str, on: AbstractJoint | Coordinate, name: str | None) -> str:
 
 def _value(value: Numbers | Callable[..., Array]) -> Array | Callable[..., Array]:
     return value if callable(value) else numbers(value)
-

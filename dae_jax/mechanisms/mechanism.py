@@ -68,7 +68,11 @@ class Mechanism(eqx.Module):
     def force(self, t: Time, q: Coordinates, v: Coordinates, args: Args) -> Coordinates:
         """f of M v̇ = f − Gᵀλ − Hᵀμ: all loads, and the inertial forces of turning bodies."""
         at = self.configuration(q, v)
-        total = jnp.zeros_like(q.values) if self.dimension == 2 else jax.vmap(inertial_force)(at.inertias, q.values, v.values)
+        total = (
+            jnp.zeros_like(q.values)
+            if self.dimension == 2
+            else jax.vmap(inertial_force)(at.inertias, q.values, v.values)
+        )
         springs = [load for load in self.loads if isinstance(load, Along)]
         for kind in sorted({load.coordinate.kind for load in springs}):
             total = total + along([load for load in springs if load.coordinate.kind == kind], t, at, args)
@@ -237,7 +241,11 @@ def _refuse_what_does_not_fit(mechanism: Mechanism, given: Sequence[AbstractJoin
     planar = [body.name for body in mechanism.bodies if body.dimension == 2]
     if planar and len(planar) < len(names):
         spatial = next(name for name in names if name not in planar)
-        raise ValueError(f"Body {planar[0]!r} is planar and body {spatial!r} is spatial: a mechanism is one or the other.")
+        raise ValueError(
+            f"Body {planar[0]!r} is planar and body {spatial!r} is spatial: a mechanism is one or the other."
+        )
     for x in given:
         for name in sorted(outputs.bodies_of(x) - {*names, GROUND}):
-            raise ValueError(f"{x.name!r} is on the body {name!r}, which is none of the mechanism's: {', '.join(names)}.")
+            raise ValueError(
+                f"{x.name!r} is on the body {name!r}, which is none of the mechanism's: {', '.join(names)}."
+            )

@@ -1,5 +1,6 @@
 """Mechanisms from MJCF and URDF files, by MuJoCo's own reader (the extra `[mjcf]`)."""
 
+import importlib
 import os
 import warnings
 from collections.abc import Iterator
@@ -41,7 +42,7 @@ def read_mjcf(source: str | os.PathLike[str]) -> Mechanism:
     out, with one warning that names them.
     """
     try:
-        import mujoco
+        mujoco: Model = importlib.import_module("mujoco")
     except ImportError as missing:
         raise ImportError('`read_mjcf` reads files by MuJoCo: pip install "dae_jax[mjcf]".') from missing
     text = os.fspath(source)
@@ -81,7 +82,11 @@ class _Reader:
 
     def _refuse_other_physics(self) -> None:
         model = self.model
-        for count, what in ((model.ntendon, "tendons"), (model.nflex, "flexible bodies"), (model.nmocap, "mocap bodies")):
+        for count, what in (
+            (model.ntendon, "tendons"),
+            (model.nflex, "flexible bodies"),
+            (model.nmocap, "mocap bodies"),
+        ):
             if count:
                 self.unsupported.append(f"{count} {what}")
         if model.opt.density or model.opt.viscosity:
@@ -179,7 +184,9 @@ class _Reader:
             return
         of_bodies = int(model.eq_objtype[k]) == self.mujoco.mjtObj.mjOBJ_BODY
         if kind not in (CONNECT, WELD) or not of_bodies:
-            self.unsupported.append(f"equality {name!r}, which is no connect or weld of bodies and no equality of joints")
+            self.unsupported.append(
+                f"equality {name!r}, which is no connect or weld of bodies and no equality of joints"
+            )
             return
         a, b = self._part(one), self._part(two)
         if a is None or b is None:
@@ -211,7 +218,10 @@ class _Reader:
         """What is no part of a mechanism, by name."""
         model = self.model
         limited = [self._name("joint", int(j)) for j in np.flatnonzero(model.jnt_limited)]
-        touching = [self._name("geom", int(k)) for k in np.flatnonzero(model.geom_contype | model.geom_conaffinity)]
+        touching = [
+            self._name("geom", int(k))
+            for k in np.flatnonzero(np.logical_or(model.geom_contype, model.geom_conaffinity))
+        ]
         disabled = model.opt.disableflags & self.mujoco.mjtDisableBit.mjDSBL_CONTACT
         driven = [self._name("actuator", k) for k in range(model.nu)]
         idle = [self._name("equality", int(k)) for k in np.flatnonzero(~model.eq_active0.astype(bool))]

@@ -71,7 +71,9 @@ def effort(mechanism: "Mechanism", sol: DAESolution, name: str) -> Float[Array, 
             # g grows with c at the rate 1 where it is 0, and pulls by −λ.
             return -diagnostics.multipliers(mechanism.system(), sol)[..., row]
     known = [x.name for x in (*mechanism.loads, *mechanism.joints) if isinstance(x, Along | Motion)]
-    raise ValueError(f"There is no motor, spring or damper {name!r}; there are {', '.join(map(repr, known)) or 'none'}.")
+    raise ValueError(
+        f"There is no motor, spring or damper {name!r}; there are {', '.join(map(repr, known)) or 'none'}."
+    )
 
 
 def reaction(
@@ -140,7 +142,9 @@ def _at_saved_times(
     mechanism: "Mechanism", sol: DAESolution, of: Callable[[Time, Configuration, Args], Array]
 ) -> Float[Array, " times"]:
     """of(t, configuration, args) at each saved time."""
-    return _mapped(lambda t, y, args: of(t, mechanism.configuration(*y), args), without_padding(sol.ts, sol.ys), sol.args)
+    return _mapped(
+        lambda t, y, args: of(t, mechanism.configuration(*y), args), without_padding(sol.ts, sol.ys), sol.args
+    )
 
 
 @eqx.filter_jit

@@ -184,7 +184,7 @@ def _check_mass(system: ConstrainedSystem, q: State, args: Args) -> None:
     is_structure = _shapes(mass) in (_shapes(q), _shapes([0.0] * n)) and _all_numbers(mass)
     if not is_array and not is_structure:
         raise ValueError(
-            f"`{name}` must be a vector of {n} masses, a ({n}, {n}) matrix, (blocks, k, k) with {n} rows in all, or have the structure of q, {describe(q)}, but is "
+            f"`{name}` must be a vector of {n} masses, a ({n}, {n}) matrix, or have the structure of q, {describe(q)}, but is "
             f"{describe(mass)}."
         )
 

@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 import dae_jax
-from dae_jax import compiler, plotting, reductions, scenes
+from dae_jax import compiler, mechanisms, plotting, reductions, scenes
 
 
 State = tuple[Array, Array]
@@ -170,6 +170,17 @@ def of_a_scene() -> float:
     sol = dae_jax.daesolve(scene.system, dae_jax.RATTLE(), 0.0, 1.0, 0.01, scene.y0)
     plotting.drift({"RATTLE": (times, dae_jax.drift(scene.system, sol).position)}).savefig("drift.png")
     return scene.error(times, sol.ys)
+
+
+def of_a_mechanism() -> tuple[Array, ...]:
+    rod = mechanisms.Body("rod", mass=1.0, inertia=0.1, at=(0.5, 0.0))
+    hinge = mechanisms.revolute(mechanisms.ground, rod, at=(0, 0), name="hinge")
+    drive = mechanisms.motor(hinge, torque=1.0, name="motor")
+    mechanism = mechanisms.Mechanism([rod], [hinge], [mechanisms.gravity((0.0, -9.81)), drive])
+    y0 = mechanism.assemble(at={"hinge": 0.3})
+    sol = dae_jax.daesolve(mechanism.system(), dae_jax.RATTLE(), 0.0, 1.0, 0.01, y0)
+    force, moment = mechanism.reaction(sol, "hinge", axes="body")
+    return y0[0]["rod"], mechanism.coordinate(sol, "hinge"), mechanism.effort(sol, "motor"), force, moment
 
 
 def old_name() -> dae_jax.Reset:

@@ -27,6 +27,7 @@ def test_a_five_bar_with_a_motor_moves_as_in_minimal_coordinates():
     )
     assert scene.error(times, sol.ys) < 1e-8
     drawn = scene.drawing
+    assert drawn is not None
     assert drawn.points(0.0, scene.y0[0]).shape == (4 + 2 * 5, 2)
     assert max(max(pair) for pair in drawn.links) < 14
 

@@ -60,10 +60,10 @@ def test_a_joint_in_space(joint: str):
     far = Rotation.from_rotvec([0.2, 0.9, -0.4])
     for k, row in enumerate(moved):
         whole = turned(far * Rotation.from_quat(np.roll(row[3:], -1)))
-        moved[k] = np.concatenate([far.apply(row[:3]) + [1.0, 2.0, 3.0], whole])
+        moved[k] = np.concatenate([far.apply(row[:3]) + np.arange(1.0, 4.0), whole])
     assert np.abs(mechanism.constraint(0.0, of(mechanism, a=moved[0], b=moved[1]), None)).max() < 1e-14
     # And what it does not leave free, it sees.
-    pushed = of(mechanism, b=np.concatenate([np.asarray(B.at) + [0.1, 0.2, -0.3], np.asarray(B.orientation)]))
+    pushed = of(mechanism, b=np.concatenate([np.asarray(B.at) + np.array([0.1, 0.2, -0.3]), np.asarray(B.orientation)]))
     assert np.abs(mechanism.constraint(0.0, pushed, None)).max() > 1e-2
 
 

@@ -17,7 +17,8 @@ PENDULUM = """<mujoco><option gravity="0 0 -9.81" integrator="RK4"><flag contact
 <body name="tip" pos=".5 0 .1"><geom size=".05" mass=".3"/></body></body></worldbody></mujoco>"""
 
 LOOP = """<mujoco><option gravity="0 0 -9.81"/><worldbody>
-<body name="left"><joint name="a" axis="0 1 0" range="-90 90" limited="true"/><geom type="capsule" size=".05" fromto="0 0 0 0 0 1" mass="1"/>
+<body name="left"><joint name="a" axis="0 1 0" range="-90 90" limited="true"/>
+<geom type="capsule" size=".05" fromto="0 0 0 0 0 1" mass="1"/>
 <body name="top" pos="0 0 1"><joint name="b" axis="0 1 0"/><geom type="capsule" size=".05" fromto="0 0 0 2 0 0" mass="1"/>
 </body></body>
 <body name="right" pos="2 0 0"><joint name="c" axis="0 1 0"/><geom type="capsule" size=".05" fromto="0 0 0 0 0 1" mass="1"/></body>

@@ -37,7 +37,10 @@ BLOCK = m.Body("block", 1.0, (0.1, 0.1, 0.1))
         (lambda: m.Mechanism([ROD], [m.revolute(m.ground, ROD, (0, 0))] * 2), "'ground-rod': give one"),
         (lambda: m.Mechanism([ROD]).assemble({"crank": (0, 0, 0)}), "'crank', which is no body"),
         (lambda: m.Mechanism([ROD]).assemble({"rod": (0, 0)}), "must be 3 numbers"),
-        (lambda: m.Mechanism([ROD], [m.revolute(m.ground, ROD, (0, 0))]).assemble(at={"hinge": 1.0}), "no coordinate 'hinge'"),
+        (
+            lambda: m.Mechanism([ROD], [m.revolute(m.ground, ROD, (0, 0))]).assemble(at={"hinge": 1.0}),
+            "no coordinate 'hinge'",
+        ),
     ],
 )
 def test_what_is_wrong_is_named(make, said: str):

@@ -1,10 +1,8 @@
 """Single bodies in space against what is known of them: elliptic functions, conserved quantities, Euler's equations."""
 
 import diffrax
-import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from scipy.special import ellipj
 
 import dae_jax
