@@ -209,6 +209,7 @@ def _along(inertia: Float[Array, "3 3"]) -> Float[Array, ""]:
     return 4 * jnp.trace(inertia) / 3
 
 
+# What bodies are joined to that are joined to the world: it does not move, and its axes are the world's.
 ground = Ground()
 
 
