@@ -26,6 +26,7 @@ LOOP = """<mujoco><option gravity="0 0 -9.81"/><worldbody>
 <joint name="gear" joint1="a" joint2="c"/></equality><actuator><motor name="drive" joint="a"/></actuator></mujoco>"""
 
 
+@pytest.mark.slow
 def test_a_pendulum_moves_as_mujoco_moves_it():
     mechanism = m.read_mjcf(PENDULUM)
     times = np.linspace(0, 1, 11)
@@ -53,6 +54,7 @@ def test_a_pendulum_moves_as_mujoco_moves_it():
     assert off[1] / off[2] > 8
 
 
+@pytest.mark.slow
 def test_a_loop_is_closed_and_what_is_left_out_is_named():
     with pytest.warns(UserWarning, match=r"limits of 'a'; contacts of .*; actuators 'drive'"):
         mechanism = m.read_mjcf(LOOP)
