@@ -67,12 +67,13 @@ from .systems import (
 
 
 if _TYPE_CHECKING:
-    from . import compiler as compiler, scenes as scenes
+    from . import compiler as compiler, mechanisms as mechanisms, scenes as scenes
     from .app import plotting as plotting
     from .studies import reductions as reductions
 
 _MODULES = {
     "compiler": ".compiler",
+    "mechanisms": ".mechanisms",
     "plotting": ".app.plotting",
     "reductions": ".studies.reductions",
     "scenes": ".scenes",

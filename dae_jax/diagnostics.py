@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from .equations.constraint_jacobian import Rank
+from .equations.constraint_jacobian import Rank, dense_mass
 from .equations.mechanical import MechanicalODE
 from .equations.residual_drift import EquationDrift, equation_drift
 from .solution import DAESolution, without_padding
@@ -81,7 +81,7 @@ def energy(system: ConstrainedSystem, sol: DAESolution) -> Float[Array, " times"
         refuse_no_real_number(returned(call, potential, y[0], args), call)
         ode = MechanicalODE.of(system, t, y, args)
         flat_q, flat_v = ode.encode(y)
-        mass = ode.mass(flat_q)
+        mass = dense_mass(ode.mass(flat_q))
         momentum = flat_v if mass is None else mass * flat_v if mass.ndim < 2 else jnp.dot(mass, flat_v)
         return jnp.dot(flat_v, momentum) / 2 + potential(y[0], args)
 

@@ -290,8 +290,12 @@ def _name(module: eqx.Module) -> str:
     return type(module).__name__ + (f"({_name(inner)})" if inner is not None else "")
 
 
+# What a mass of two and of three axes is.
+_MATRICES = {2: "a full mass matrix", 3: "a block-diagonal mass matrix"}
+
+
 def _mass(system: ConstrainedSystem, mass: Float[Array, "..."] | None) -> str:
-    kind = "unit masses" if mass is None else "diagonal masses" if mass.ndim < 2 else "a full mass matrix"
+    kind = "unit masses" if mass is None else "diagonal masses" if mass.ndim < 2 else _MATRICES[mass.ndim]
     return kind + (" that depend on q" if callable(system.mass) else "")
 
 

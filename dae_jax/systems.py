@@ -60,7 +60,8 @@ class ConstrainedSystem(AbstractSystem):
       centrifugal terms belong here too.
     - `constraint(t, q, args)`: g. It may depend on time. `None` for a purely nonholonomic system.
     - `mass`: `None` (unit masses), a vector of `n` masses (also with the structure of `q`), an `(n, n)` symmetric
-      positive definite matrix, or a function `(q, args) → (n, n)` matrix.
+      positive definite matrix, `(b, k, k)` for b blocks on the diagonal of a matrix (n = b k), or a function `(q, args)` that
+      returns any of these.
     - `nonholonomic(t, q, v, args)`: h, constraints at velocity level (rolling, knife edge).
     - `potential(q, args)`: the potential energy; used by `energy` alone.
     - `rank`: how many of the m + p constraints are independent, where some are redundant, or a pair, how many of the m
@@ -104,8 +105,8 @@ class ConstrainedSystem(AbstractSystem):
             found.append(Call("nonholonomic(t, q, v, args)", self.nonholonomic, (t, q, v, args), "vector"))
         return found
 
-    def mass_matrix(self, q: State, args: Args = None) -> Float[Array, "n n"] | Float[Array, " n"] | None:
-        """M at `q`: `None` for unit masses, a vector if diagonal, else a matrix."""
+    def mass_matrix(self, q: State, args: Args = None) -> Float[Array, "..."] | None:
+        """M at `q`: `None` for unit masses, a vector if diagonal, else a matrix, or (b, k, k) if block-diagonal."""
         mass = self.mass(q, args) if callable(self.mass) else self.mass
         if mass is None:
             return None

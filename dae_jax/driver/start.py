@@ -11,7 +11,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 
 from ..consistent import unsolved, violation
-from ..equations.constraint_jacobian import Rank
+from ..equations.constraint_jacobian import Rank, dense_mass
 from ..equations.mechanical import MechanicalODE
 from ..equations.regularity import mass_is_regular, mass_message, rank_message, rank_of, redundancy
 from ..solution import RESULTS
@@ -95,7 +95,7 @@ def refuse_bad_start(system: System, t0: Time, y0: State, args: Args, invertible
         return None
     ode, mass, regular, found, redundant = _look(system, t0, y0, args, invertible)
     if not bool(regular):
-        raise ValueError(mass_message(np.asarray(mass), invertible))
+        raise ValueError(mass_message(np.asarray(dense_mass(mass)), invertible))
     if not bool(found.consistent()):
         raise ValueError(found.message() + _advice(system, t0, y0, args))
     message = rank_message(ode, redundant, system.rank)

@@ -71,18 +71,19 @@ class DenseNormals:
         rank = self.rank[b.shape[0] == self.holonomic + self.nonholonomic]
         return scale * semidefinite_solve(gram * scale[:, None] * scale, scale * b, rank)
 
-    def lengths(self, normals: Normals) -> Float[Array, " c"]:
+    def lengths(self, ode: Mechanism, normals: Normals) -> Float[Array, " c"]:
         """The length of each row of A."""
         return jnp.sqrt(jnp.sum(normals[0] ** 2, 1))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SparseNormals:
-    """A by its nonzeros, for holonomic constraints and unit or diagonal masses.
+    """A by its nonzeros, for holonomic constraints and unit, diagonal or block-diagonal masses.
 
     A is compressed to C = A S, one directional derivative of the constraints a colour, in which row i has at most one
     column `columns[c, i]` of colour c. The entries of A M⁻¹Aᵀ are then sums over the colours. Products with A and Aᵀ
-    are derivatives of the constraints themselves. Compared by identity: keep one for each pattern.
+    are derivatives of the constraints themselves. Where masses are blocks, M = L Lᵀ, C is that of A L⁻ᵀ, whose masses are 1; a row
+    of it has all columns of a block of which A has one. Compared by identity: keep one for each pattern.
     """
 
     columns: Int[np.ndarray, "colours c"]
@@ -93,8 +94,15 @@ class SparseNormals:
         self, ode: Mechanism, t: Time, q: Flat, v: Flat
     ) -> tuple[Any, Float[Array, " n"], Float[Array, "colours c"]]:
         """The point, and C there."""
-        tangent = lambda seed: jax.jvp(functools.partial(ode.constraint, t), (q,), (seed,))[1]
-        return jnp.asarray(t, q.dtype), q, jax.vmap(tangent)(jnp.asarray(self.seeds, q.dtype))
+        mass, seeds = ode.mass(q), jnp.asarray(self.seeds, q.dtype)
+        if mass is not None and mass.ndim == 3:
+            seeds = _unweighted(mass, seeds)
+        return jnp.asarray(t, q.dtype), q, self._compressed(ode, t, q, seeds)
+
+    def _compressed(
+        self, ode: Mechanism, t: Time, q: Flat, seeds: Float[Array, "colours n"]
+    ) -> Float[Array, "colours c"]:
+        return jax.vmap(lambda seed: jax.jvp(functools.partial(ode.constraint, t), (q,), (seed,))[1])(seeds)
 
     def along(self, ode: Mechanism, normals: Normals, x: Float[Array, " n"]) -> Float[Array, " c"]:
         """A x."""
@@ -112,7 +120,7 @@ class SparseNormals:
         _, q, compressed = normals
         mass = ode.mass(q)
         rows, columns = self.gram.rows, self.gram.columns
-        weighted = compressed if mass is None else compressed * self._inverse_masses(mass)
+        weighted = compressed if mass is None or mass.ndim == 3 else compressed * self._inverse_masses(mass)
         shared = jnp.asarray(
             (self.columns[:, rows] == self.columns[:, columns]) & (self.columns[:, rows] >= 0), q.dtype
         )
@@ -120,16 +128,22 @@ class SparseNormals:
         couplings = jnp.sum(shared * at(weighted, rows) * at(compressed, columns), 0)
         return self.gram.solve(jnp.sum(weighted * compressed, 0), couplings, b)
 
-    def lengths(self, normals: Normals) -> Float[Array, " c"]:
+    def lengths(self, ode: Mechanism, normals: Normals) -> Float[Array, " c"]:
         """The length of each row of A."""
-        return jnp.sqrt(jnp.sum(normals[2] ** 2, 0))
+        t, q, compressed = normals
+        if getattr(ode.mass(q), "ndim", 0) == 3:
+            compressed = self._compressed(ode, t, q, jnp.asarray(self.seeds, q.dtype))
+        return jnp.sqrt(jnp.sum(compressed**2, 0))
 
     def _inverse_masses(self, mass: Float[Array, "..."]) -> Float[Array, "colours c"]:
         return 1 / (jnp.broadcast_to(mass, (self.seeds.shape[1],))[np.maximum(self.columns, 0)])
 
 
-def sparse_normals(pattern: Bool[np.ndarray, "c n"]) -> SparseNormals | None:
-    """The sparse form for A with this pattern, where it takes fewer operations than the dense one."""
+def sparse_normals(pattern: Bool[np.ndarray, "c n"], block: int = 1) -> SparseNormals | None:
+    """The sparse form for A with this pattern, where it takes fewer operations than the dense one; `block`: the rows of a block
+    of the mass matrix.
+    """
+    pattern = np.repeat(pattern.reshape(len(pattern), -1, block).any(2), block, 1)
     found = _sparse_normals(pattern.tobytes(), pattern.shape)
     return found if found.gram.cost < len(pattern) ** 3 // 3 else None
 
@@ -153,13 +167,31 @@ def constraint_pattern(constraint: Callable[[Time, Flat], Array], t: Time, q: Fl
         return None
 
 
+def _unweighted(mass: Float[Array, "b k k"], seeds: Float[Array, "colours n"]) -> Float[Array, "colours n"]:
+    """L⁻ᵀ of the blocks times each seed."""
+    factor = jnp.linalg.cholesky(mass)
+    by_block = jnp.moveaxis(seeds.reshape(len(seeds), *mass.shape[:2]), 0, -1)
+    solved = jax.scipy.linalg.solve_triangular(factor, by_block, trans=1, lower=True)
+    return jnp.moveaxis(solved, -1, 0).reshape(seeds.shape)
+
+
 def mass_solve(mass: Float[Array, "..."] | None, x: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
     """M⁻¹ x for M as `ConstrainedSystem.mass_matrix` gives it."""
     if mass is None:
         return x
     if mass.ndim < 2:
         return x / (mass[:, None] if mass.ndim and x.ndim == 2 else mass)
+    if mass.ndim == 3:
+        return jax.vmap(semidefinite_solve)(mass, x.reshape(*mass.shape[:2], *x.shape[1:])).reshape(x.shape)
     return semidefinite_solve(mass, x)
+
+
+def dense_mass(mass: Float[Array, "..."] | None) -> Float[Array, "..."] | None:
+    """The same, a block-diagonal matrix written out."""
+    if mass is None or mass.ndim < 3:
+        return mass
+    count, k, _ = mass.shape
+    return (jnp.eye(count, dtype=mass.dtype)[:, None, :, None] * mass[:, :, None, :]).reshape(count * k, count * k)
 
 
 def unit_diagonal(s: Float[Array, "c c"]) -> Float[Array, " c"]:

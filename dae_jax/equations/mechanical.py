@@ -70,8 +70,9 @@ class MechanicalODE(ManifoldODE):
 
     def _sparse(self, t: Time, q: Flat) -> SparseNormals | None:
         mass = jax.eval_shape(self.mass, q)
-        pattern = constraint_pattern(self.constraint, t, q) if mass is None or mass.ndim < 2 else None
-        return None if pattern is None else sparse_normals(pattern)
+        pattern = constraint_pattern(self.constraint, t, q) if mass is None or mass.ndim != 2 else None
+        block = mass.shape[1] if mass is not None and mass.ndim == 3 else 1
+        return None if pattern is None else sparse_normals(pattern, block)
 
     @property
     def rank(self) -> Rank | None:
@@ -95,7 +96,7 @@ class MechanicalODE(ManifoldODE):
         return self.layout.flatten(self.system.force(t, flat(q), flat(v), self.args)).astype(q.dtype)
 
     def unchecked_mass(self, q: Float[Array, " n"]) -> Float[Array, "..."] | None:
-        """M(q) as the system has it: `None`, a vector (diagonal) or a matrix."""
+        """M(q) as the system has it: `None`, a vector (diagonal), blocks on the diagonal or a matrix."""
         mass = self.system.mass_matrix(self.layout.unflatten(q), self.args)
         return None if mass is None else mass.astype(q.dtype)
 
@@ -107,8 +108,9 @@ class MechanicalODE(ManifoldODE):
         sizes = jax.lax.stop_gradient(mass)
         if mass.ndim < 2:
             return jnp.where(sizes >= 0, mass, jnp.nan)
-        off = jnp.max(jnp.abs(sizes - sizes.T)) <= jnp.finfo(q.dtype).eps ** 0.75 * jnp.max(jnp.abs(sizes))
-        return jnp.where(off, mass, jnp.nan)
+        asymmetry = jnp.max(jnp.abs(sizes - jnp.swapaxes(sizes, -1, -2)))
+        symmetric = asymmetry <= jnp.finfo(q.dtype).eps ** 0.75 * jnp.max(jnp.abs(sizes))
+        return jnp.where(symmetric, mass, jnp.nan)
 
     def constraint(self, t: Time, q: Float[Array, " n"]) -> Float[Array, " m"]:
         """g(t, q)."""
@@ -184,7 +186,7 @@ class MechanicalODE(ManifoldODE):
         self, t: Time, y: Phase, normals: Normals, target: Float[Array, " c"], pulled: Flat
     ) -> Any:
         """x = M⁻¹Aᵀλ, or NaN where it leaves more of A x = b than y is off the constraints: dependent ones disagree."""
-        lengths = self.linear.lengths(normals)
+        lengths = self.linear.lengths(self, normals)
         lengths = jnp.where(lengths > 0, lengths, 1)
         off = jnp.max(jnp.abs(self.linear.along(self, normals, pulled) - target) / lengths)
         drift = jnp.max(jnp.concatenate(self.distances(t, y)))
@@ -205,7 +207,7 @@ class MechanicalODE(ManifoldODE):
     @at_one_instant
     def distances(self, t: Time, y: Phase) -> tuple[Float[Array, " m"], Float[Array, " mp"]]:
         """The invariants divided by the length of each constraint's gradient: about how far y is from satisfying them."""
-        lengths = self.linear.lengths(self.normals(t, y))
+        lengths = self.linear.lengths(self, self.normals(t, y))
         lengths = jnp.where(lengths > 0, lengths, 1)
         g, velocity = self.invariants(t, y)
         return jnp.abs(g) / lengths[: self.holonomic], jnp.abs(velocity) / lengths

@@ -31,12 +31,18 @@ def mass_is_regular(ode: MechanicalODE, q: Float[Array, " n"], invertible: bool)
     mass = ode.unchecked_mass(q)
     if mass is None:
         return jnp.asarray(True)
+    if mass.ndim == 3:
+        return jnp.all(jax.vmap(lambda block: _is_regular(block, invertible))(mass))
     if mass.ndim < 2:
         return jnp.all(mass > 0) if invertible else jnp.all(mass >= 0)
+    return _is_regular(mass, invertible)
+
+
+def _is_regular(mass: Float[Array, "n n"], invertible: bool) -> Bool[Array, ""]:
     diagonal = jnp.diagonal(mass)
     scale = 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
-    roundoff = jnp.finfo(q.dtype).eps ** 0.75
-    least = 8 * len(mass) * jnp.finfo(q.dtype).eps if invertible else -roundoff
+    roundoff = jnp.finfo(mass.dtype).eps ** 0.75
+    least = 8 * len(mass) * jnp.finfo(mass.dtype).eps if invertible else -roundoff
     scaled = mass * scale[:, None] * scale + (0 if invertible else 2 * roundoff) * jnp.eye(len(mass), dtype=mass.dtype)
     symmetric = jnp.max(jnp.abs(mass - mass.T)) <= roundoff * jnp.max(jnp.abs(mass))
     return symmetric & jnp.all(diagonal >= 0) & (smallest_pivot(scaled) > least)

@@ -13,6 +13,7 @@ from ..linalg import row_products, solve
 from ..structure.layout import Layout
 from ..systems import SemiExplicitDAE, System, is_implicit, is_mechanism
 from ..types import Args, DType, Phase, State, Time
+from .constraint_jacobian import dense_mass
 from .manifold_ode import at_one_instant
 from .mechanical import MechanicalODE
 
@@ -112,7 +113,7 @@ class ResidualForm(eqx.Module):
             return self, self.encode(state)
         ode = MechanicalODE.of(self.system, t, state, self.args)
         flat = ode.encode(state)
-        a, mass = ode.constraint_jacobian(t, *flat), ode.mass(flat[0])
+        a, mass = ode.constraint_jacobian(t, *flat), dense_mass(ode.mass(flat[0]))
         squares = jnp.sum(a * a, 1)
         squares = jnp.where(squares > 0, squares, 1)
         masses = jnp.ones_like(squares) if mass is None else jnp.sum(a * _weighted(mass, a.T).T, 1) / squares
@@ -168,7 +169,7 @@ class ResidualForm(eqx.Module):
         n, m, p = ode.layout.size, ode.holonomic, ode.nonholonomic
         q, v = y[:n], y[n : 2 * n]
         multipliers, eta = jnp.split(y[2 * n :] if self.units is None else y[2 * n :] * self.units, [m + p])
-        a, mass = ode.constraint_jacobian(t, q, v), ode.mass(q)
+        a, mass = ode.constraint_jacobian(t, q, v), dense_mass(ode.mass(q))
         momentum = _weighted(mass, yd[n : 2 * n]) - ode.force(t, q, v) + jnp.sum(multipliers[:, None] * a, 0)
         velocity = ode.velocity_constraint(t, q, v)
         kinematics = yd[:n] - v

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from ..equations.constraint_jacobian import Rank
+from ..equations.constraint_jacobian import Rank, dense_mass
 from ..equations.manifold_ode import at_one_instant
 from ..equations.mechanical import MechanicalODE
 from ..linalg import newton, semidefinite_solve
@@ -111,7 +111,7 @@ class ChartODE(eqx.Module):
         jacobian = jax.jacfwd(self.position, 1)(t, z)
         q, v = self.position(t, z), self.velocity(t, z, w)
         _, bias = ode._along(lambda t, z: self.velocity(t, z, w), self.takes_time, t, (z,), (w,))
-        mass = ode.mass(q)
+        mass = dense_mass(ode.mass(q))
         if mass is None:
             apply: Callable[[Any], Any] = lambda x: x
         elif mass.ndim < 2:

@@ -180,13 +180,17 @@ def _check_mass(system: ConstrainedSystem, q: State, args: Args) -> None:
     if mass is None:
         return
     n = _count(q)
-    is_array = isinstance(mass, NUMBERS) and jnp.shape(mass) in ((), (n,), (n, n))
+    is_array = isinstance(mass, NUMBERS) and (jnp.shape(mass) in ((), (n,), (n, n)) or _is_blocks(jnp.shape(mass), n))
     is_structure = _shapes(mass) in (_shapes(q), _shapes([0.0] * n)) and _all_numbers(mass)
     if not is_array and not is_structure:
         raise ValueError(
             f"`{name}` must be a vector of {n} masses, a ({n}, {n}) matrix, or have the structure of q, {describe(q)}, but is "
             f"{describe(mass)}."
         )
+
+
+def _is_blocks(shape: tuple[int, ...], n: int) -> bool:
+    return len(shape) == 3 and shape[1] == shape[2] and shape[0] * shape[1] == n
 
 
 def _all_numbers(tree: PyTree) -> bool:

@@ -61,9 +61,15 @@ PAGES = {
         "compiler.jit compiler.Jitted configure compiler.*",
     ),
     "scenes": ("Scenes", "Ready systems, each with a reference of its own.", "scenes.Scene scenes.Drawing scenes.*"),
+    "mechanisms": (
+        "Mechanisms",
+        "Bodies, joints, loads and files, as a system like any other.",
+        "mechanisms.Body mechanisms.ground mechanisms.Mechanism mechanisms.revolute mechanisms.prismatic mechanisms.cylindrical "
+        "mechanisms.spherical mechanisms.universal mechanisms.planar mechanisms.fixed mechanisms.distance mechanisms.*",
+    ),
     "plotting": ("Plotting", "Figures; matplotlib is imported when one is drawn.", "plotting.*"),
 }  # fmt: skip
-MODULES = ("", "reductions", "compiler", "scenes", "plotting")
+MODULES = ("", "reductions", "compiler", "scenes", "mechanisms", "plotting")
 
 
 def public(module: ModuleType) -> dict[str, Any]:

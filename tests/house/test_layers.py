@@ -19,7 +19,7 @@ FLOORS = (
     {"linalg"},
     {"equations"},
     {"analyse", "consistent", "diagnostics", "formulations", "solvers"},
-    {"driver"},
+    {"driver", "mechanisms"},
     {"solve"},
     {"explain", "studies"},
     {"app"},

@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 import dae_jax
-from dae_jax import compiler, plotting, reductions, scenes
+from dae_jax import compiler, mechanisms, plotting, reductions, scenes
 
 
 State = tuple[Array, Array]
@@ -182,6 +182,17 @@ def moving(sol: dae_jax.DAESolution) -> str:
     film.save("pendulum.gif", dpi=72)
     sol.animate(drawing, system=pendulum).save("pendulum.html")
     return film.html()
+
+
+def of_a_mechanism() -> tuple[Array, ...]:
+    rod = mechanisms.Body("rod", mass=1.0, inertia=0.1, at=(0.5, 0.0))
+    hinge = mechanisms.revolute(mechanisms.ground, rod, at=(0, 0), name="hinge")
+    drive = mechanisms.motor(hinge, torque=1.0, name="motor")
+    mechanism = mechanisms.Mechanism([rod], [hinge], [mechanisms.gravity((0.0, -9.81)), drive])
+    y0 = mechanism.assemble(at={"hinge": 0.3})
+    sol = dae_jax.daesolve(mechanism.system(), dae_jax.RATTLE(), 0.0, 1.0, 0.01, y0)
+    force, moment = mechanism.reaction(sol, "hinge", axes="body")
+    return y0[0]["rod"], mechanism.coordinate(sol, "hinge"), mechanism.effort(sol, "motor"), force, moment
 
 
 def old_name() -> dae_jax.Reset:

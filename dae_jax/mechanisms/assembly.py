@@ -1,0 +1,202 @@
+"""A consistent start of a mechanism, or which joint cannot close and by how much."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from ..consistent import consistent_state
+from ..systems import ConstrainedSystem
+from ..types import Args, Time
+from .bodies import GROUND, numbers
+from .configuration import Coordinates
+from .outputs import coordinate_named
+
+
+if TYPE_CHECKING:
+    from .mechanism import Mechanism
+
+
+# What a joint may be open, in parts of the mechanism's size.
+CLOSED = 1e-9
+# By how much more the joints of a spanning tree count than those that close loops, where not all can be closed.
+TREE = 1e4
+
+
+def assembled(
+    mechanism: "Mechanism",
+    guess: Any,
+    at: Mapping[str, Any],
+    rates: Mapping[str, Any],
+    t0: Time,
+    args: Args,
+) -> tuple[Coordinates, Coordinates]:
+    """The consistent state nearest to a guess, with these values of coordinates and rates."""
+    start = _start(mechanism, guess)
+    system = _with_values(mechanism, at, rates, t0)
+    try:
+        return consistent_state(system, t0, start, args)
+    except ValueError as refusal:
+        open_by, nearest = _gaps(mechanism, system, t0, start, args)
+        scale = 1 + float(jnp.max(jnp.abs(start[0].values)))
+        if max(open_by.values(), default=0.0) <= CLOSED * scale:
+            # The guess was too far off for Newton's method, and its positions are not: from those closed ones it converges.
+            try:
+                return consistent_state(system, t0, (nearest, start[1]), args)
+            except ValueError:
+                raise ValueError(_message({}, 0.0)) from refusal
+        raise ValueError(_message(open_by, CLOSED * scale)) from refusal
+
+
+def rank(mechanism: "Mechanism", y0: tuple[Coordinates, Coordinates], t0: Time, args: Args) -> tuple[int, int]:
+    """The numerical rank of the constraints' Jacobians, rows scaled to length 1."""
+    (q, v), system = y0, mechanism.system()
+    flat_q, of_q = ravel_pytree(q)
+    flat_v, of_v = ravel_pytree(v)
+    if isinstance(flat_q, Tracer):
+        raise ValueError("`rank` needs a state that is concrete: find it before `vmap` or `jit`, at one design.")
+    rows = [np.zeros((0, len(flat_q)))]
+    if system.constraint is not None:
+        rows.append(np.asarray(jax.jacfwd(lambda x: mechanism.constraint(t0, of_q(x), args))(flat_q)))
+    holonomic = _rank(np.concatenate(rows))
+    if system.nonholonomic is not None:
+        rows.append(np.asarray(jax.jacfwd(lambda x: mechanism.nonholonomic(t0, q, of_v(x), args))(flat_v)))
+    return holonomic, _rank(np.concatenate(rows))
+
+
+def _rank(a: Float[np.ndarray, "m n"]) -> int:
+    lengths = np.linalg.norm(a, axis=1, keepdims=True)
+    return int(np.linalg.matrix_rank(a / np.where(lengths > 0, lengths, 1), rtol=np.finfo(a.dtype).eps ** 0.5))
+
+
+def _start(mechanism: "Mechanism", guess: Any) -> tuple[Coordinates, Coordinates]:
+    q, v = mechanism.reference
+    given = guess if isinstance(guess, tuple) else (guess if guess is not None else {}, {})
+    found = []
+    for what, found_so_far, part in zip(("positions", "velocities"), (q, v), given, strict=True):
+        if isinstance(part, Coordinates):
+            found.append(part)
+            continue
+        for name, value in part.items():
+            row, known = numbers(value), found_so_far.names
+            if name not in known:
+                raise ValueError(f"`guess` has {what} of {name!r}, which is no body; bodies are {', '.join(known)}.")
+            if row.shape != found_so_far[name].shape:
+                count = len(found_so_far[name])
+                raise ValueError(
+                    f"`guess`: the {what} of {name!r} must be {count} numbers, but have the shape {row.shape}."
+                )
+            found_so_far = found_so_far.put(name, row)
+        found.append(found_so_far)
+    return found[0], found[1]
+
+
+def _with_values(
+    mechanism: "Mechanism", at: Mapping[str, Any], rates: Mapping[str, Any], t0: Time
+) -> ConstrainedSystem:
+    """The mechanism's equations and those that fix values of coordinates and rates."""
+    system = mechanism.system()
+    if not at and not rates:
+        return system
+    held = {name: coordinate_named(mechanism, name) for name in (*at, *rates)}
+
+    def off(name: str, q: Coordinates) -> Array:
+        c, configuration = held[name], mechanism.configuration(q)
+        if c.kind == "angle" and mechanism.dimension == 3:
+            sine, cosine = c.direction(configuration)
+            return jnp.arctan2(
+                sine * jnp.cos(at[name]) - cosine * jnp.sin(at[name]),
+                cosine * jnp.cos(at[name]) + sine * jnp.sin(at[name]),
+            )
+        return c(configuration) - at[name]
+
+    def constraint(t: Time, q: Coordinates, args: Args) -> Array:
+        # What has a rate beside a value moves on from it.
+        extra = [off(name, q) - rates.get(name, 0.0) * (t - t0) for name in at]
+        rows = [] if system.constraint is None else [mechanism.constraint(t, q, args)]
+        return jnp.concatenate([*rows, *(jnp.reshape(x, 1) for x in extra)])
+
+    def nonholonomic(t: Time, q: Coordinates, v: Coordinates, args: Args) -> Array:
+        configuration = mechanism.configuration(q, v)
+        extra = [held[name].with_rate(configuration)[1] - rate for name, rate in rates.items() if name not in at]
+        rows = [] if system.nonholonomic is None else [mechanism.nonholonomic(t, q, v, args)]
+        return jnp.concatenate([*rows, *(jnp.reshape(x, 1) for x in extra)])
+
+    has_rates = system.nonholonomic is not None or set(rates) - set(at)
+    has_positions = system.constraint is not None or at
+    return ConstrainedSystem(
+        system.force,
+        constraint if has_positions else None,
+        system.mass,
+        nonholonomic if has_rates else None,
+    )
+
+
+def _gaps(
+    mechanism: "Mechanism", system: ConstrainedSystem, t0: Time, start: tuple[Coordinates, Coordinates], args: Args
+) -> tuple[dict[str, float], Coordinates]:
+    """What each joint is open by where those that close a loop are closed as far as the others, which are, allow; and where that is."""
+    from scipy.optimize import least_squares
+
+    flat, unflatten = ravel_pytree(start[0])
+    constraint = system.constraint
+    if constraint is None:
+        return {}, start[0]
+    g = jax.jit(lambda x: jnp.ravel(constraint(t0, unflatten(x), args)))
+    slope = jax.jit(jax.jacfwd(g))
+    rows, closing = mechanism.rows(), _closing(mechanism)
+    weights = np.full(g(flat).shape[0], TREE)
+    for name in closing:
+        weights[rows[name][0]] = 1.0
+    found = least_squares(
+        lambda x: weights * np.asarray(g(x)),
+        np.asarray(flat),
+        lambda x: weights[:, None] * np.asarray(slope(x)),  # pyright: ignore[reportArgumentType]
+        method="trf",
+        xtol=1e-15,
+        ftol=1e-15,
+        gtol=1e-15,
+        max_nfev=500,
+    )
+    left = np.asarray(g(found.x))
+    gaps = {name: float(np.linalg.norm(left[g_rows])) for name, (g_rows, _) in rows.items() if g_rows}
+    return gaps, unflatten(jnp.asarray(found.x, flat.dtype))
+
+
+def _closing(mechanism: "Mechanism") -> list[str]:
+    """The joints that join what other joints, listed before them, have joined already."""
+    leader = {name: name for name in (GROUND, *(body.name for body in mechanism.bodies))}
+
+    def find(name: str) -> str:
+        while leader[name] != name:
+            name = leader[name]
+        return name
+
+    closing = []
+    for joint in mechanism.joints:
+        a, b = find(joint.on_a.body), find(joint.on_b.body)
+        if a == b:
+            closing.append(joint.name)
+        leader[a] = b
+    return closing
+
+
+def _message(gaps: dict[str, float], allowed: float) -> str:
+    still_open = sorted(((gap, name) for name, gap in gaps.items() if gap > allowed), reverse=True)
+    if not still_open:
+        return (
+            "All joints close, but no velocities fit them: the values in `rates` contradict the joints (of a mechanism that cannot "
+            "move they are 0), or a motor moves what cannot move."
+        )
+    gap, worst = still_open[0]
+    others = "".join(f"\n  {name!r} by {gap:.6g}" for gap, name in still_open[1:])
+    return (
+        f"The mechanism cannot be assembled from this guess: joint {worst!r} stays open by {gap:.6g} when all others are closed as "
+        "far as they can be (m, or the sine of an angle). Bodies are too short or too long for this loop, or the guess is "
+        "too far off." + (f"\nAlso open:{others}" if others else "")
+    )

@@ -1,0 +1,169 @@
+"""All bodies at one instant: poses and twists by name; markers, which are points with axes on a body; coordinates of joints."""
+
+from typing import Literal, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .bodies import Body, Ground, Pose, Twist, dimension, ground, ground_row, pose, reference_pose, twist
+from .rotations import rotate
+
+
+Kind = Literal["angle", "displacement", "distance"]
+
+
+class Coordinates(eqx.Module):
+    """The coordinates of all bodies, or their velocities, or the forces on them: `q["crank"]` is that of one body. The state of a
+    mechanism is a pair (q, v) of these. A solution's have a leading axis of times.
+    """
+
+    values: Float[Array, "*times bodies k"]
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    def __getitem__(self, name: str) -> Float[Array, "*times k"]:
+        if name not in self.names:
+            raise KeyError(f"There is no body {name!r}; bodies are {', '.join(self.names)}.")
+        return self.values[..., self.names.index(name), :]
+
+    def put(self, name: str, row: Float[Array, " k"]) -> "Coordinates":
+        """The same with another row for one body."""
+        return Coordinates(self.values.at[self.names.index(name)].set(row), self.names)
+
+
+class Configuration:
+    """All bodies at one instant, the ground as the last row: coordinates, poses, and with velocities the twists."""
+
+    def __init__(self, bodies: tuple[Body, ...], q: Coordinates, v: Coordinates | None = None) -> None:
+        self.bodies, self.q, self.v, self.names = bodies, q, v, (*q.names, ground.name)
+        self.dimension = 2 if q.values.shape[1] == 3 else 3
+        below = jnp.asarray(ground_row(self.dimension), q.values.dtype)[None]
+        self.rows = jnp.concatenate([q.values, below])
+        self.velocities = None if v is None else jnp.concatenate([v.values, 0 * below])
+        self.poses: Pose = jax.vmap(pose)(self.rows)
+
+    @property
+    def masses(self) -> Float[Array, " bodies"]:
+        """Those of the bodies."""
+        return jnp.stack([body.mass for body in self.bodies])
+
+    @property
+    def inertias(self) -> Float[Array, "bodies ..."]:
+        """Those of the bodies, in their axes."""
+        return jnp.stack([body.inertia for body in self.bodies])
+
+    def row(self, name: str) -> int:
+        """Which row a body has."""
+        return self.names.index(name)
+
+    def pose(self, name: str) -> Pose:
+        """Where a body is."""
+        k = self.row(name)
+        return jax.tree.map(lambda x: x[k], self.poses)
+
+    def twist(self, name: str) -> Twist:
+        """How it moves."""
+        assert self.velocities is not None
+        k = self.row(name)
+        return twist(self.rows[k], self.velocities[k])
+
+    def table(self, name: str, row: Float[Array, " k"]) -> Float[Array, "bodies k"]:
+        """Forces on all bodies of which one is not 0."""
+        return jnp.asarray(np.arange(len(self.q.names)) == self.row(name), row.dtype)[:, None] * row
+
+
+MarkerArrays: TypeAlias = tuple[Float[Array, " d"], Float[Array, "d d"], Float[Array, ""]]
+
+
+class Marker(eqx.Module):
+    """A point of a body, and a frame there whose columns are its axes, in body axes; in the plane also the body's angle in the
+    reference configuration, whose turns a frame does not know.
+    """
+
+    body: str = eqx.field(static=True)
+    point: Float[Array, " d"]
+    frame: Float[Array, "d d"]
+    angle: Float[Array, ""]
+
+    def moved_to(self, point: Float[Array, " d"]) -> "Marker":
+        """The same axes at another point of the body."""
+        return Marker(self.body, point, self.frame, self.angle)
+
+    def position(self, at: Configuration) -> Float[Array, " d"]:
+        """The point in the world."""
+        return at.pose(self.body).point(self.point)
+
+    @property
+    def arrays(self) -> MarkerArrays:
+        """Point, frame and angle."""
+        return self.point, self.frame, self.angle
+
+    def axis(self, at: Configuration, column: int) -> Float[Array, " d"]:
+        """An axis of the frame, in world axes."""
+        return rotate(at.pose(self.body).rotation, self.frame[:, column])
+
+
+class Coordinate(eqx.Module):
+    """What a joint leaves free, or the distance of two points: a number c(q) along which springs, dampers and motors act.
+
+    - `angle`: of b against a, in rad, 0 in the reference configuration; in space about the joint's axis and within (−π, π].
+    - `displacement`: of b against a along the axis, in m.
+    - `distance`: of the two points, in m.
+    """
+
+    name: str = eqx.field(static=True)
+    kind: Kind = eqx.field(static=True)
+    on_a: Marker
+    on_b: Marker
+
+    def __call__(self, at: Configuration) -> Float[Array, ""]:
+        """c(q)."""
+        a, b = at.row(self.on_a.body), at.row(self.on_b.body)
+        return value(self.kind, at.rows[a], at.rows[b], self.on_a.arrays, self.on_b.arrays)
+
+    def with_rate(self, at: Configuration) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """c and ċ."""
+        assert at.velocities is not None
+        a, b = at.row(self.on_a.body), at.row(self.on_b.body)
+        c = lambda qa, qb: value(self.kind, qa, qb, self.on_a.arrays, self.on_b.arrays)
+        return jax.jvp(c, (at.rows[a], at.rows[b]), (at.velocities[a], at.velocities[b]))
+
+    def direction(self, at: Configuration) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Sine and cosine of an angle in space."""
+        x = self.on_b.axis(at, 0)
+        return jnp.sum(x * self.on_a.axis(at, 1)), jnp.sum(x * self.on_a.axis(at, 0))
+
+
+def value(
+    kind: Kind, q_a: Float[Array, " k"], q_b: Float[Array, " k"], on_a: MarkerArrays, on_b: MarkerArrays
+) -> Float[Array, ""]:
+    """A coordinate, from those of two bodies."""
+    a, b, d = pose(q_a), pose(q_b), dimension(q_a)
+    if kind == "angle":
+        if d == 2:
+            return (q_b[2] - on_b[2]) - (q_a[2] - on_a[2])
+        x = rotate(b.rotation, on_b[1][:, 0])
+        return jnp.arctan2(
+            jnp.sum(x * rotate(a.rotation, on_a[1][:, 1])), jnp.sum(x * rotate(a.rotation, on_a[1][:, 0]))
+        )
+    difference = b.point(on_b[0]) - a.point(on_a[0])
+    if kind == "displacement":
+        return jnp.sum(difference * rotate(a.rotation, on_a[1][:, axis_of(d)]))
+    square = jnp.sum(difference**2)
+    # The direction of two points that coincide is none: their force is 0, and not NaN.
+    apart = square > 0
+    return jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1)), 0)
+
+
+def axis_of(dimension: int) -> int:
+    """The column of a joint's frame that is its axis: x in the plane, z in space."""
+    return 0 if dimension == 2 else 2
+
+
+def marker(body: Body | Ground, point: Float[Array, " d"], frame: Float[Array, "d d"]) -> Marker:
+    """The marker that is at a point of the world, with these axes, in the reference configuration."""
+    place = reference_pose(body, point.shape[0])
+    axes = jnp.sum(place.rotation[:, :, None] * frame[:, None, :], 0)
+    return Marker(body.name, place.local(point), axes, jnp.zeros(()) if place.angle is None else place.angle)

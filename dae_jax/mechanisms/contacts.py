@@ -1,0 +1,282 @@
+"""Joints that are no lower pairs: a rod without mass, a point on a curve, a wheel that rolls, and a motor whose motion is given."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from ..types import Args, Time
+from .bodies import Numbers, numbers, reference_pose
+from .configuration import Configuration, Coordinate, Kind, Marker
+from .joints import AbstractJoint, Part, Points, dimension_of, frame_along, label_of, markers, only_coordinate, unit
+
+
+class Distance(AbstractJoint):
+    """A rod without mass between two points, (|d|² − ℓ²)/(2ℓ) = 0."""
+
+    name: str = eqx.field(static=True)
+    on_a: Marker
+    on_b: Marker
+    length: Float[Array, ""]
+
+    def constraint(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
+        difference = self.on_b.position(at) - self.on_a.position(at)
+        return (jnp.sum(difference**2)[None] - self.length**2) / (2 * self.length)
+
+    def nonholonomic(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
+        return jnp.zeros(0)
+
+    @property
+    def coordinates(self) -> dict[Kind, Coordinate]:
+        return {}
+
+
+class OnCurve(AbstractJoint):
+    """A point of b on a curve, or in space on a surface, of a: 0 = curve(p), p in the axes of a."""
+
+    name: str = eqx.field(static=True)
+    on_a: Marker
+    on_b: Marker
+    curve: Callable[[Array], Array]
+
+    def constraint(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
+        return jnp.ravel(jnp.asarray(self.curve(at.pose(self.on_a.body).local(self.on_b.position(at)))))
+
+    def nonholonomic(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
+        return jnp.zeros(0)
+
+    @property
+    def coordinates(self) -> dict[Kind, Coordinate]:
+        return {}
+
+
+class Rolling(AbstractJoint):
+    """A wheel, or a ball, on a plane of a. With the plane's normal n and the wheel's axis u, the point of contact is at
+
+        ρ = −R (n − (n·u) u)/|n − (n·u) u|        (−R n of a ball, and in the plane)
+
+    from the centre p_b, the wheel touches, n·(p_b − p_a + ρ) = 0, and does not slip: the velocities of the two bodies there are
+    equal along the plane.
+    """
+
+    name: str = eqx.field(static=True)
+    on_a: Marker
+    on_b: Marker
+    radius: Float[Array, ""]
+    disc: bool = eqx.field(static=True)
+
+    def _contact(self, at: Configuration) -> Float[Array, " d"]:
+        n = self._normal(at)
+        if self.disc:
+            u = self.on_b.axis(at, 2)
+            n = n - jnp.sum(n * u) * u
+            n = n / jnp.sqrt(jnp.sum(n**2))
+        return -self.radius * n
+
+    def _normal(self, at: Configuration) -> Float[Array, " d"]:
+        return self.on_a.axis(at, 0 if at.dimension == 2 else 2)
+
+    def constraint(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
+        touching = self.on_b.position(at) - self.on_a.position(at) + self._contact(at)
+        return jnp.sum(touching * self._normal(at))[None]
+
+    def nonholonomic(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
+        contact = self.on_b.position(at) + self._contact(at)
+        of_a, of_b = (at.twist(m.body).at(contact - at.pose(m.body).position) for m in (self.on_a, self.on_b))
+        along = (1,) if at.dimension == 2 else (0, 1)
+        return jnp.stack([jnp.sum((of_b - of_a) * self.on_a.axis(at, i)) for i in along])
+
+    @property
+    def coordinates(self) -> dict[Kind, Coordinate]:
+        return {}
+
+
+class Motion(AbstractJoint):
+    """A motor whose motion is given: c(q) − motion(t) = 0 of an angle, a displacement or a distance c; of an angle in space its
+    sine, which is smooth for any number of turns.
+    """
+
+    name: str = eqx.field(static=True)
+    coordinate: Coordinate
+    motion: Callable[[Time, Args], Array]
+
+    @property
+    def on_a(self) -> Marker:
+        return self.coordinate.on_a
+
+    @property
+    def on_b(self) -> Marker:
+        return self.coordinate.on_b
+
+    def constraint(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
+        wanted = jnp.reshape(jnp.asarray(self.motion(t, args)), ())
+        if self.coordinate.kind == "angle" and at.dimension == 3:
+            sine, cosine = self.coordinate.direction(at)
+            return (sine * jnp.cos(wanted) - cosine * jnp.sin(wanted))[None]
+        return (self.coordinate(at) - wanted)[None]
+
+    def nonholonomic(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
+        return jnp.zeros(0)
+
+    @property
+    def coordinates(self) -> dict[Kind, Coordinate]:
+        return {self.coordinate.kind: self.coordinate}
+
+
+class Coupling(AbstractJoint):
+    """Two coordinates that go together, c₁ = Σ aₖ c₂ᵏ: a gear, a rack, a screw. Of an angle in space it is the sine of the difference
+    that is 0: turns do not count, where c₂ is an angle too if a₁ is a whole number.
+    """
+
+    name: str = eqx.field(static=True)
+    first: Coordinate
+    second: Coordinate | None
+    coefficients: Float[Array, " k"]
+
+    @property
+    def on_a(self) -> Marker:
+        return self.first.on_a
+
+    @property
+    def on_b(self) -> Marker:
+        return self.first.on_b
+
+    def constraint(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
+        other = jnp.zeros(()) if self.second is None else self.second(at)
+        off = self.first(at) - jnp.polyval(self.coefficients[::-1], other)
+        return (jnp.sin(off) if self.first.kind == "angle" and at.dimension == 3 else off)[None]
+
+    def nonholonomic(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
+        return jnp.zeros(0)
+
+    @property
+    def coordinates(self) -> dict[Kind, Coordinate]:
+        return {}
+
+
+def coupling(
+    first: AbstractJoint | Coordinate,
+    second: AbstractJoint | Coordinate | None,
+    coefficients: Numbers,
+    *,
+    name: str | None = None,
+) -> Coupling:
+    """Two coordinates that go together, c₁ = Σ aₖ c₂ᵏ, or one that is held, c₁ = a₀.
+
+    **Arguments**
+
+    - `first`, `second`: joints with one coordinate, or their coordinates.
+    - `coefficients`: (a₀, a₁, ...): (0, −2) is a gear of ratio 2 that turns the other way.
+    """
+    one, two = only_coordinate(first), None if second is None else only_coordinate(second)
+    label = f"coupling of {one.name}" if name is None else name
+    # Its markers, fields of other joints, are those of its first coordinate.
+    return Coupling(label, one, two, jnp.atleast_1d(numbers(coefficients)))  # pyright: ignore[reportCallIssue]
+
+
+def distance(
+    a: Part,
+    b: Part,
+    at: Points | None = None,
+    *,
+    length: Numbers | None = None,
+    anchors: Points | None = None,
+    name: str | None = None,
+) -> Distance:
+    """A rod without mass between a point of a and a point of b.
+
+    **Arguments**
+
+    - `at`: the two points in the world, in the reference configuration; or `anchors`: in the axes of their bodies.
+    - `length`: in m; that in the reference configuration if not given.
+
+    Errors: `ValueError` for a length that is not positive.
+    """
+    label, on = label_of(a, b, name), between(a, b, at, anchors=anchors, name=name)
+    if length is None:
+        length = jnp.sqrt(jnp.sum((_in_reference(b, on.on_b) - _in_reference(a, on.on_a)) ** 2))
+    return Distance(label, on.on_a, on.on_b, _positive(label, "length", length))
+
+
+def between(
+    a: Part, b: Part, at: Points | None = None, *, anchors: Points | None = None, name: str | None = None
+) -> Coordinate:
+    """The distance of a point of a from a point of b, for a spring, a damper or a motor between them. Arguments as those of
+    `distance`.
+    """
+    label = label_of(a, b, name)
+    if at is None:
+        return Coordinate(label, "distance", *markers(a, b, label, None, anchors))
+    if len(at) != 2:
+        raise ValueError(f"Joint {label!r}: `at` must be two points, one of each body.")
+    on_a, _ = markers(a, b, label, at[0], None)
+    _, on_b = markers(a, b, label, at[1], None)
+    return Coordinate(label, "distance", on_a, on_b)
+
+
+def point_on_curve(
+    a: Part,
+    b: Part,
+    at: Numbers | None = None,
+    *,
+    curve: Callable[[Array], Array],
+    anchor: Numbers | None = None,
+    name: str | None = None,
+) -> OnCurve:
+    """A point of b on a curve of a, which is given by equations: in the plane one, `curve(p)` = 0; in space a curve by two, a
+    surface by one.
+
+    **Arguments**
+
+    - `curve(p)`: the equations, p the point in the axes of a (of the ground: in the world).
+    - `at`: the point in the world, in the reference configuration, or `anchor`: in the axes of b; its centre of mass if
+      neither is given.
+    """
+    label, d = label_of(a, b, name), dimension_of(a, b)
+    if at is None:
+        on_a, on_b = markers(a, b, label, None, (jnp.zeros(d), jnp.zeros(d) if anchor is None else anchor))
+    else:
+        on_a, on_b = markers(a, b, label, at, None)
+    shape = jax.eval_shape(lambda p: jnp.asarray(curve(p)), jax.ShapeDtypeStruct((d,), on_b.point.dtype)).shape
+    if sum(shape) >= d or len(shape) > 1:
+        raise ValueError(f"Joint {label!r}: `curve(p)` must be 1 to {d - 1} equations, but has the shape {shape}.")
+    return OnCurve(label, on_a, on_b, curve)
+
+
+def rolling(
+    a: Part,
+    wheel: Part,
+    *,
+    radius: Numbers,
+    at: Numbers,
+    normal: Numbers,
+    axis: Numbers | None = None,
+    name: str | None = None,
+) -> Rolling:
+    """A wheel that rolls without slip on a plane (in the plane: on a line) of a.
+
+    **Arguments**
+
+    - `radius`: in m. The wheel's centre is its centre of mass.
+    - `at`, `normal`: a point of the plane and its normal towards the wheel, in the world, in the reference configuration.
+    - `axis`: the wheel's, in the world there; without it, in space, it is a ball.
+    """
+    label, d = label_of(a, wheel, name), dimension_of(a, wheel)
+    on_a, _ = markers(a, wheel, label, at, None, frame_along(unit(label, normal, d)))
+    axes = jnp.eye(d) if axis is None else frame_along(unit(label, axis, d))
+    _, on_b = markers(a, wheel, label, None, (jnp.zeros(d), jnp.zeros(d)), axes)
+    return Rolling(label, on_a, on_b, _positive(label, "radius", radius), d == 3 and axis is not None)
+
+
+def _in_reference(body: Part, at: Marker) -> Float[Array, " d"]:
+    return reference_pose(body, len(at.point)).point(at.point)
+
+
+def _positive(label: str, what: str, value: Numbers) -> Float[Array, ""]:
+    number = numbers(value)
+    if not isinstance(number, Tracer) and not (number.ndim == 0 and number > 0):
+        raise ValueError(f"Joint {label!r}: `{what}` must be a positive number, but is {value}.")
+    return number

@@ -1,0 +1,49 @@
+"""What of a mechanism is drawn: centres of mass, joints, and the lines between them."""
+
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..scenes.scene import Drawing
+from ..types import Time
+from .bodies import GROUND
+from .configuration import Coordinates, Marker
+from .contacts import Distance
+from .loads import Along
+
+
+if TYPE_CHECKING:
+    from .mechanism import Mechanism
+
+
+class Points(eqx.Module):
+    """The centres of mass, and after them a list of markers, in the world."""
+
+    mechanism: "Mechanism"
+    markers: tuple[Marker, ...]
+
+    def __call__(self, t: Time, q: Coordinates) -> Float[Array, "points d"]:
+        at = self.mechanism.configuration(q)
+        centres = at.poses.position[:-1]
+        return jnp.concatenate([centres, *(marker.position(at)[None] for marker in self.markers)])
+
+
+def drawing(mechanism: "Mechanism") -> Drawing:
+    """Each body as lines from its centre of mass to its joints (through it, where there are two), springs between their ends."""
+    names = [body.name for body in mechanism.bodies]
+    springs = [
+        load.coordinate for load in mechanism.loads if isinstance(load, Along) and load.coordinate.kind == "distance"
+    ]
+    markers = [marker for x in (*mechanism.joints, *springs) for marker in (x.on_a, x.on_b)]
+    at = lambda k: len(names) + k
+    links = {(names.index(marker.body), at(k)) for k, marker in enumerate(markers) if marker.body != GROUND}
+    rods = {(at(2 * k), at(2 * k + 1)) for k, joint in enumerate(mechanism.joints) if isinstance(joint, Distance)}
+    first = 2 * len(mechanism.joints)
+    return Drawing(
+        Points(mechanism, tuple(markers)),
+        {name: k for k, name in enumerate(names)},
+        tuple(sorted(links | rods)),
+        tuple((at(first + 2 * k), at(first + 2 * k + 1)) for k in range(len(springs))),
+    )

@@ -1,0 +1,355 @@
+"""Joints: the lower pairs, each by as many equations as it takes degrees of freedom.
+
+With the markers p_a, F_a = (x_a, y_a, z_a) on a and p_b, F_b on b, z (in the plane x) along the joint's axis, and d = p_b − p_a:
+
+| joint | equations in space | in the plane |
+|---|---|---|
+| `revolute` | d = 0, x_a·z_b = y_a·z_b = 0 | d = 0 |
+| `prismatic` | d·x_a = d·y_a = 0, x_a·z_b = y_a·z_b = x_a·y_b = 0 | d·y_a = 0, φ_b − φ_a = const |
+| `cylindrical` | d·x_a = d·y_a = 0, x_a·z_b = y_a·z_b = 0 | |
+| `spherical` | d = 0 | |
+| `universal` | d = 0, x_a·y_b = 0 | |
+| `planar` | d·z_a = 0, x_a·z_b = y_a·z_b = 0 | |
+| `fixed` | d = 0, x_a·z_b = y_a·z_b = x_a·y_b = 0 | d = 0, φ_b − φ_a = const |
+
+Source: E. J. Haug, *Computer-Aided Kinematics and Dynamics of Mechanical Systems*, sections 3.3 and 9.4.
+"""
+
+import abc
+from collections.abc import Sequence
+from typing import Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from ..types import Args, Time
+from .bodies import Body, Ground, Numbers, numbers
+from .configuration import Configuration, Coordinate, Kind, Marker, marker
+from .rotations import frame
+
+
+Part = Body | Ground
+Points = tuple[Numbers, Numbers]
+
+
+class AbstractJoint(eqx.Module):
+    """Equations between two bodies, by name: `a` and `b`, whose markers are where reactions are taken."""
+
+    name: eqx.AbstractVar[str]
+    on_a: eqx.AbstractVar[Marker]
+    on_b: eqx.AbstractVar[Marker]
+
+    @abc.abstractmethod
+    def constraint(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
+        """What is 0 of the positions."""
+
+    @abc.abstractmethod
+    def nonholonomic(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
+        """What is 0 of the velocities, beyond the derivative of `constraint`."""
+
+    @property
+    @abc.abstractmethod
+    def coordinates(self) -> dict[Kind, Coordinate]:
+        """What the joint leaves free and has a number for."""
+
+    @property
+    def angle(self) -> Coordinate:
+        """That of b against a, about the joint's axis."""
+        return self._coordinate("angle")
+
+    @property
+    def displacement(self) -> Coordinate:
+        """That of b against a, along the joint's axis."""
+        return self._coordinate("displacement")
+
+    def _coordinate(self, kind: Kind) -> Coordinate:
+        if kind not in self.coordinates:
+            raise ValueError(f"Joint {self.name!r} has no {kind}.")
+        return self.coordinates[kind]
+
+
+class Joint(AbstractJoint):
+    """A lower pair: the displacement along some axes of a's frame is 0, and some axes of the two are perpendicular.
+
+    - `locked`: the axes of a's frame along which p_b does not move.
+    - `perpendicular`: pairs of an axis of a and one of b, or in the plane whether the angle is fixed.
+    - `free`: the kinds of coordinates that are left.
+    """
+
+    name: str = eqx.field(static=True)
+    on_a: Marker
+    on_b: Marker
+    locked: tuple[int, ...] = eqx.field(static=True)
+    perpendicular: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    free: tuple[Kind, ...] = eqx.field(static=True)
+
+    @property
+    def columns(self) -> list[int]:
+        """Which of d in the world, d along a's axes and the products of a's axes with b's (the angle in the plane) are 0."""
+        d = len(self.on_a.point)
+        # All of d are 0 in any axes, and simplest in the world's.
+        moves = list(range(d)) if len(self.locked) == d else [d + i for i in self.locked]
+        return moves + [2 * d + (0 if d == 2 else 3 * i + j) for i, j in self.perpendicular]
+
+    def constraint(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
+        return pairs([self], at)
+
+    def nonholonomic(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
+        return jnp.zeros(0)
+
+    @property
+    def coordinates(self) -> dict[Kind, Coordinate]:
+        return {kind: Coordinate(self.name, kind, self.on_a, self.on_b) for kind in self.free}
+
+
+def pairs(joints: Sequence[Joint], at: Configuration) -> Float[Array, " m"]:
+    """The equations of lower pairs, one after the other: all at once, so that a program does not grow with their number."""
+    if not joints:
+        return jnp.zeros(0, at.rows.dtype)
+    d = at.dimension
+    sides = []
+    for on in ([joint.on_a for joint in joints], [joint.on_b for joint in joints]):
+        rows = np.array([at.row(marker.body) for marker in on])
+        point, frame, angle = (jnp.stack(x) for x in zip(*(marker.arrays for marker in on), strict=True))
+        turn = at.poses.rotation[rows]
+        place = at.poses.position[rows] + jnp.sum(turn * point[:, None, :], 2)
+        axes = jnp.sum(turn[:, :, :, None] * frame[:, None, :, :], 2)
+        sides.append((place, axes, None if at.poses.angle is None else at.poses.angle[rows] - angle))
+    (p_a, axes_a, turned_a), (p_b, axes_b, turned_b) = sides
+    apart = p_b - p_a
+    along = jnp.sum(axes_a * apart[:, :, None], 1)
+    # In the plane the angle, whose turns axes do not show.
+    turns = (
+        (turned_b - turned_a)[:, None]
+        if d == 2
+        else jnp.sum(axes_a[:, :, :, None] * axes_b[:, :, None, :], 1).reshape(-1, 9)
+    )
+    every = jnp.concatenate([apart, along, turns], 1)
+    chosen = [k * every.shape[1] + i for k, joint in enumerate(joints) for i in joint.columns]
+    return jnp.ravel(every)[np.array(chosen)]
+
+
+def only_coordinate(on: AbstractJoint | Coordinate) -> Coordinate:
+    """That of a joint which has one, or itself."""
+    if isinstance(on, Coordinate):
+        return on
+    found = on.coordinates
+    if len(found) != 1:
+        has = " and ".join(f"`joint.{kind}`" for kind in found)
+        raise ValueError(
+            f"Joint {on.name!r} has "
+            + (f"{has}: say which." if found else "no coordinate that a load could act along.")
+        )
+    return next(iter(found.values()))
+
+
+def revolute(
+    a: Part,
+    b: Part,
+    at: Numbers | None = None,
+    *,
+    axis: Numbers | None = None,
+    anchors: Points | None = None,
+    name: str | None = None,
+) -> Joint:
+    """A hinge: b turns against a about a point, in space about an axis through it.
+
+    **Arguments**
+
+    - `a`, `b`: two bodies, or a body and `ground`.
+    - `at`: the point in the world, in m, in the reference configuration.
+    - `axis`: its direction in the world there, of any length; in space only.
+    - `anchors`: in place of `at`, the point of a and the point of b that the joint brings together, each in its body's axes (from
+      the centre of mass). They need not meet in the reference configuration: `Mechanism.assemble` brings them together.
+    - `name`: "a-b" if not given.
+
+    Errors: `ValueError` for a joint of a body with itself, an axis of length 0, points of the wrong shape.
+    """
+    if dimension_of(a, b) == 2:
+        return _pair("revolute", a, b, at, anchors, name, (0, 1), (), ("angle",), axis)
+    return _pair("revolute", a, b, at, anchors, name, (0, 1, 2), ((0, 2), (1, 2)), ("angle",), axis)
+
+
+def prismatic(
+    a: Part,
+    b: Part,
+    at: Numbers | None = None,
+    *,
+    axis: Numbers,
+    anchors: Points | None = None,
+    name: str | None = None,
+) -> Joint:
+    """A slider: b moves along an axis that is fixed in a, and does not turn against it. Arguments as those of `revolute`; without
+    `at`, the point is b's centre of mass.
+    """
+    at = _centre(b, at, anchors)
+    if dimension_of(a, b) == 2:
+        return _pair("prismatic", a, b, at, anchors, name, (1,), ((0, 1),), ("displacement",), axis)
+    rows = ((0, 2), (1, 2), (0, 1))
+    return _pair("prismatic", a, b, at, anchors, name, (0, 1), rows, ("displacement",), axis)
+
+
+def cylindrical(
+    a: Part,
+    b: Part,
+    at: Numbers | None = None,
+    *,
+    axis: Numbers,
+    anchors: Points | None = None,
+    name: str | None = None,
+) -> Joint:
+    """b moves along an axis of a and turns about it; in space. Arguments as those of `prismatic`. It has two coordinates, `joint.angle`
+    and `joint.displacement`.
+    """
+    _refuse_plane("cylindrical", a, b)
+    at = _centre(b, at, anchors)
+    return _pair("cylindrical", a, b, at, anchors, name, (0, 1), ((0, 2), (1, 2)), ("angle", "displacement"), axis)
+
+
+def spherical(
+    a: Part, b: Part, at: Numbers | None = None, *, anchors: Points | None = None, name: str | None = None
+) -> Joint:
+    """A ball joint: b turns freely against a about a point; in space. Arguments as those of `revolute`."""
+    _refuse_plane("spherical", a, b)
+    return _pair("spherical", a, b, at, anchors, name, (0, 1, 2), (), (), (0, 0, 1))
+
+
+def universal(
+    a: Part,
+    b: Part,
+    at: Numbers | None = None,
+    *,
+    axes: Points,
+    anchors: Points | None = None,
+    name: str | None = None,
+) -> Joint:
+    """A Cardan joint: `axes` are that fixed in a and that fixed in b, perpendicular in the reference configuration and ever after; in
+    space. Other arguments as those of `revolute`.
+    """
+    _refuse_plane("universal", a, b)
+    label = label_of(a, b, name)
+    x, y = (unit(label, axis, 3) for axis in axes)
+    slant = jnp.sum(x * y)
+    if not isinstance(slant, Tracer) and abs(slant) > 1e-6:
+        raise ValueError(f"Joint {label!r}: the two axes of a universal joint must be perpendicular.")
+    z = jnp.cross(x, y)
+    return _pair("universal", a, b, at, anchors, name, (0, 1, 2), ((0, 1),), (), None, jnp.stack([x, y, z], 1))
+
+
+def planar(
+    a: Part,
+    b: Part,
+    at: Numbers | None = None,
+    *,
+    normal: Numbers,
+    anchors: Points | None = None,
+    name: str | None = None,
+) -> Joint:
+    """b slides on a plane of a and turns about its normal, its angle; in space. Arguments as those of `prismatic`."""
+    _refuse_plane("planar", a, b)
+    at = _centre(b, at, anchors)
+    return _pair("planar", a, b, at, anchors, name, (2,), ((0, 2), (1, 2)), ("angle",), normal)
+
+
+def fixed(
+    a: Part, b: Part, at: Numbers | None = None, *, anchors: Points | None = None, name: str | None = None
+) -> Joint:
+    """b does not move against a. Arguments as those of `prismatic`."""
+    at = _centre(b, at, anchors)
+    if dimension_of(a, b) == 2:
+        return _pair("fixed", a, b, at, anchors, name, (0, 1), ((0, 1),), (), None)
+    return _pair("fixed", a, b, at, anchors, name, (0, 1, 2), ((0, 2), (1, 2), (0, 1)), (), (0, 0, 1))
+
+
+def _pair(
+    joint: str,
+    a: Part,
+    b: Part,
+    at: Numbers | None,
+    anchors: Points | None,
+    name: str | None,
+    locked: tuple[int, ...],
+    perpendicular: tuple[tuple[int, int], ...],
+    free: tuple[Kind, ...],
+    axis: Numbers | None,
+    axes: Float[Array, "3 3"] | None = None,
+) -> Joint:
+    label, d = label_of(a, b, name), dimension_of(a, b)
+    if axes is None:
+        if axis is None and d == 3:
+            raise ValueError(f"Joint {label!r}: a {joint} joint in space needs an axis.")
+        axes = jnp.eye(2) if axis is None else frame_along(unit(label, axis, d))
+    return Joint(label, *markers(a, b, label, at, anchors, axes), locked, perpendicular, free)
+
+
+def markers(
+    a: Part, b: Part, label: str, at: Numbers | None, anchors: Points | None, axes: Float[Array, "d d"] | None = None
+) -> tuple[Marker, Marker]:
+    """Those of a joint on a and b, from a point in the world or from a point of each."""
+    d = dimension_of(a, b)
+    if (at is None) == (anchors is None):
+        raise ValueError(
+            f"Joint {label!r}: give either `at`, a point in the world, or `anchors`, a point of each body."
+        )
+    axes = jnp.eye(d) if axes is None else axes
+    if anchors is None:
+        assert at is not None
+        point = _vector(label, "at", at, d)
+        return marker(a, point, axes), marker(b, point, axes)
+    if len(anchors) != 2:
+        raise ValueError(f"Joint {label!r}: `anchors` must be two points, one of each body.")
+    local = [_vector(label, "anchors", p, d) for p in anchors]
+    on = [marker(body, jnp.zeros(d), axes) for body in (a, b)]
+    return on[0].moved_to(local[0]), on[1].moved_to(local[1])
+
+
+def dimension_of(a: Part, b: Part) -> Literal[2, 3]:
+    """2 for bodies in the plane, 3 in space."""
+    found = {body.dimension for body in (a, b) if isinstance(body, Body)}
+    if len(found) != 1:
+        what = "one is planar and one is spatial" if found else "neither moves"
+        raise ValueError(
+            f"A joint needs two bodies of one kind, or a body and the ground; of {a.name!r} and {b.name!r} {what}."
+        )
+    return 2 if found == {2} else 3
+
+
+def label_of(a: Part, b: Part, name: str | None) -> str:
+    """The name of what is between two bodies, which must not be the same."""
+    label = f"{a.name}-{b.name}" if name is None else name
+    if a.name == b.name:
+        raise ValueError(f"Joint {label!r} is between {a.name!r} and itself, and needs two bodies.")
+    return label
+
+
+def _refuse_plane(joint: str, a: Part, b: Part) -> None:
+    if dimension_of(a, b) == 2:
+        raise ValueError(f"A {joint} joint is one of bodies in space, but {a.name!r} and {b.name!r} are planar.")
+
+
+def _centre(b: Part, at: Numbers | None, anchors: Points | None) -> Numbers | None:
+    return b.at if at is None and anchors is None and isinstance(b, Body) else at
+
+
+def _vector(label: str, what: str, value: Numbers, d: int) -> Float[Array, " d"]:
+    array = numbers(value)
+    if array.shape != (d,):
+        raise ValueError(f"Joint {label!r}: `{what}` must be of {d} numbers, but has the shape {array.shape}.")
+    return array
+
+
+def unit(label: str, axis: Numbers, d: int) -> Float[Array, " d"]:
+    """The direction of an axis, which must have one."""
+    vector = _vector(label, "axis", axis, d)
+    length = jnp.sqrt(jnp.sum(vector**2))
+    if not isinstance(length, Tracer) and not (np.isfinite(length) and length > 0):
+        raise ValueError(f"Joint {label!r} has an axis of length {float(length):g}, which has no direction.")
+    return vector / length
+
+
+def frame_along(axis: Float[Array, " d"]) -> Float[Array, "d d"]:
+    """Columns with the axis first in the plane, last in space."""
+    return jnp.stack([axis, jnp.stack([-axis[1], axis[0]])], 1) if len(axis) == 2 else frame(axis)

@@ -1,0 +1,235 @@
+"""Mechanisms from MJCF and URDF files, by MuJoCo's own reader (the extra `[mjcf]`)."""
+
+import importlib
+import os
+import warnings
+from collections.abc import Iterator
+from typing import Any, TypeAlias
+
+import numpy as np
+from jaxtyping import Float
+
+from . import contacts, joints, loads
+from .bodies import Body, Ground, ground
+from .configuration import Coordinate
+from .joints import AbstractJoint
+from .loads import AbstractLoad
+from .mechanism import Mechanism
+
+
+# MuJoCo's compiled model and its state; it has no types of its own that a checker without it could know.
+Model: TypeAlias = Any
+
+FREE, BALL, SLIDE, HINGE = range(4)
+CONNECT, WELD, JOINT = range(3)
+# Axes count as parallel or perpendicular, and points as one, up to this.
+NEAR = 1e-6
+
+
+def read_mjcf(source: str | os.PathLike[str]) -> Mechanism:
+    """The mechanism of an MJCF or URDF file, in space; its reference configuration is the model's `qpos0`.
+
+    Bodies that are welded to each other are one. Hinge, slide, ball and free joints, a hinge and a slide along one axis (`cylindrical`),
+    two perpendicular hinges through one point (`universal`), springs and dampers of joints, equality constraints `connect`,
+    `weld` and `joint`, and gravity are taken over; loops are closed exactly, where MuJoCo's are soft. Names are those of
+    the file; what has none is "body 3", "joint 0" or "equality 1".
+
+    **Arguments**
+
+    - `source`: the path of a file, or the text of one.
+
+    Errors: `ImportError` without MuJoCo; `ValueError` that lists all that is not supported. Limits, contacts and actuators are left
+    out, with one warning that names them.
+    """
+    try:
+        mujoco: Model = importlib.import_module("mujoco")
+    except ImportError as missing:
+        raise ImportError('`read_mjcf` reads files by MuJoCo: pip install "dae_jax[mjcf]".') from missing
+    text = os.fspath(source)
+    model = (mujoco.MjModel.from_xml_string if text.lstrip().startswith("<") else mujoco.MjModel.from_xml_path)(text)
+    reader = _Reader(model, mujoco.MjData(model), mujoco)
+    if reader.unsupported:
+        raise ValueError("The file has what is not supported here:\n" + "\n".join(f"  {x}" for x in reader.unsupported))
+    left_out = list(reader.left_out())
+    if left_out:
+        warnings.warn("Left out of the mechanism: " + "; ".join(left_out) + ".", stacklevel=2)
+    return Mechanism(list(reader.bodies.values()), reader.joints, reader.loads)
+
+
+class _Reader:
+    """What is found in a model, part by part, and what in it is not supported."""
+
+    def __init__(self, model: Model, data: Model, mujoco: Model) -> None:
+        self.model, self.data, self.mujoco = model, data, mujoco
+        self.unsupported: list[str] = []
+        self.joints: list[AbstractJoint] = []
+        self.loads: list[AbstractLoad | AbstractJoint] = []
+        self.coordinates: dict[int, Coordinate] = {}
+        data.qpos[:] = model.qpos0
+        mujoco.mj_kinematics(model, data)
+        self._refuse_other_physics()
+        self.bodies = {int(i): body for i in np.unique(model.body_weldid) if i and (body := self._body(int(i)))}
+        for i in self.bodies:
+            self._joints_of(i)
+        for k in range(model.neq):
+            self._equality(k)
+        if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY and np.any(model.opt.gravity):
+            self.loads.append(loads.gravity(model.opt.gravity))
+
+    def _name(self, kind: str, k: int) -> str:
+        of = {"body": "BODY", "joint": "JOINT", "equality": "EQUALITY", "geom": "GEOM", "actuator": "ACTUATOR"}[kind]
+        return self.mujoco.mj_id2name(self.model, getattr(self.mujoco.mjtObj, f"mjOBJ_{of}"), k) or f"{kind} {k}"
+
+    def _refuse_other_physics(self) -> None:
+        model = self.model
+        for count, what in (
+            (model.ntendon, "tendons"),
+            (model.nflex, "flexible bodies"),
+            (model.nmocap, "mocap bodies"),
+        ):
+            if count:
+                self.unsupported.append(f"{count} {what}")
+        if model.opt.density or model.opt.viscosity:
+            self.unsupported.append("a fluid around the bodies (density, viscosity)")
+        for i in np.flatnonzero(model.body_gravcomp):
+            self.unsupported.append(f"gravity compensation of body {self._name('body', int(i))!r}")
+
+    def _body(self, i: int) -> Body | None:
+        """All that is welded to body i, about their common centre of mass, in axes that are the world's at `qpos0`."""
+        model, data = self.model, self.data
+        parts = np.flatnonzero(model.body_weldid == i)
+        masses, places = model.body_mass[parts], data.xipos[parts]
+        total = masses.sum()
+        if not total > 0:
+            self.unsupported.append(f"body {self._name('body', i)!r}, which moves and has no mass")
+            return None
+        centre = masses @ places / total
+        inertia = np.zeros((3, 3))
+        for mass, place, turn, moments in zip(
+            masses, places, data.ximat[parts].reshape(-1, 3, 3), model.body_inertia[parts], strict=True
+        ):
+            arm = place - centre
+            inertia += turn @ np.diag(moments) @ turn.T + mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+        return Body(self._name("body", i), total, inertia, at=centre)
+
+    def _part(self, i: int) -> Body | Ground | None:
+        """The body that body i of the file is a part of."""
+        welded = int(self.model.body_weldid[i])
+        return self.bodies.get(welded) if welded else ground
+
+    def _joints_of(self, i: int) -> None:
+        model, data = self.model, self.data
+        parent, body = self._part(int(model.body_parentid[i])), self.bodies[i]
+        ids = list(range(model.body_jntadr[i], model.body_jntadr[i] + model.body_jntnum[i]))
+        if parent is None:
+            return
+        kinds = [int(model.jnt_type[j]) for j in ids]
+        at, axes, name = data.xanchor[ids[0]], data.xaxis[ids], self._name("joint", ids[0])
+        if kinds == [HINGE]:
+            self._add(joints.revolute(parent, body, at, axis=axes[0], name=name), {ids[0]: "angle"})
+        elif kinds == [SLIDE]:
+            self._add(joints.prismatic(parent, body, at, axis=axes[0], name=name), {ids[0]: "displacement"})
+        elif kinds == [BALL]:
+            self._add(joints.spherical(parent, body, at, name=name), {})
+        elif sorted(kinds) == [SLIDE, HINGE] and axes[0] @ axes[1] > 1 - NEAR:
+            hinge, slide = ids if kinds[0] == HINGE else ids[::-1]
+            joint = joints.cylindrical(parent, body, data.xanchor[hinge], axis=axes[0], name=name)
+            self._add(joint, {hinge: "angle", slide: "displacement"})
+        elif kinds == [HINGE, HINGE] and abs(axes[0] @ axes[1]) < NEAR and self._meet(ids):
+            self._add(joints.universal(parent, body, at, axes=(axes[0], axes[1]), name=name), {})
+        elif kinds != [FREE]:
+            listed = ", ".join(repr(self._name("joint", j)) for j in ids)
+            self.unsupported.append(f"the joints {listed} of body {body.name!r} together")
+            return
+        for j in ids:
+            self._forces_of(j)
+
+    def _add(self, joint: AbstractJoint, kinds: dict[int, Any]) -> None:
+        self.joints.append(joint)
+        self.coordinates |= {j: joint.coordinates[kind] for j, kind in kinds.items()}
+
+    def _meet(self, ids: list[int]) -> bool:
+        return bool(np.linalg.norm(self.data.xanchor[ids[0]] - self.data.xanchor[ids[1]]) < NEAR)
+
+    def _forces_of(self, j: int) -> None:
+        """Springs and dampers of a joint; what else acts there is not supported."""
+        model, name = self.model, self._name("joint", j)
+        start = int(model.jnt_dofadr[j])
+        dofs = slice(start, start + {FREE: 6, BALL: 3}.get(int(model.jnt_type[j]), 1))
+        for field in ("dof_armature", "dof_frictionloss", "dof_dampingpoly"):
+            if np.any(getattr(model, field, np.zeros(model.nv))[dofs]):
+                self.unsupported.append(f"{field.removeprefix('dof_')} of joint {name!r}")
+        if np.any(getattr(model, "jnt_stiffnesspoly", np.zeros(model.njnt))[j]):
+            self.unsupported.append(f"stiffnesspoly of joint {name!r}")
+        stiffness, damping = float(model.jnt_stiffness[j]), float(model.dof_damping[start])
+        if j not in self.coordinates:
+            if stiffness or np.any(model.dof_damping[dofs]):
+                self.unsupported.append(f"spring or damper of joint {name!r}, which is not along one coordinate")
+            return
+        if stiffness:
+            k = int(model.jnt_qposadr[j])
+            rest = model.qpos_spring[k] - model.qpos0[k]
+            self.loads.append(loads.spring(self.coordinates[j], stiffness, rest, name=f"spring of {name}"))
+        if damping:
+            self.loads.append(loads.damper(self.coordinates[j], damping, name=f"damper of {name}"))
+
+    def _equality(self, k: int) -> None:
+        model, data = self.model, self.data
+        name, kind, numbers = self._name("equality", k), int(model.eq_type[k]), model.eq_data[k]
+        if not model.eq_active0[k]:
+            return
+        one, two = int(model.eq_obj1id[k]), int(model.eq_obj2id[k])
+        if kind == JOINT:
+            self._joint_equality(name, one, two, numbers)
+            return
+        of_bodies = int(model.eq_objtype[k]) == self.mujoco.mjtObj.mjOBJ_BODY
+        if kind not in (CONNECT, WELD) or not of_bodies:
+            self.unsupported.append(
+                f"equality {name!r}, which is no connect or weld of bodies and no equality of joints"
+            )
+            return
+        a, b = self._part(one), self._part(two)
+        if a is None or b is None:
+            return
+        turns = data.xmat.reshape(-1, 3, 3)
+        if kind == CONNECT:
+            points = [data.xpos[i] + turns[i] @ p for i, p in ((one, numbers[:3]), (two, numbers[3:6]))]
+            local = tuple(p - (x.at if isinstance(x, Body) else 0) for p, x in zip(points, (a, b), strict=True))
+            self.joints.append(joints.spherical(a, b, anchors=(local[0], local[1]), name=name))
+            return
+        place, turn = turns[one].T @ (data.xpos[two] - data.xpos[one]), np.zeros(9)
+        self.mujoco.mju_quat2Mat(turn, numbers[6:10])
+        as_it_is = np.allclose(place, numbers[3:6], atol=NEAR) and np.allclose(
+            turns[one].T @ turns[two], turn.reshape(3, 3), atol=NEAR
+        )
+        if not as_it_is:
+            self.unsupported.append(f"weld {name!r}, whose relative pose is not that of `qpos0`")
+            return
+        self.joints.append(joints.fixed(a, b, data.xpos[two] + turns[two] @ numbers[:3], name=name))
+
+    def _joint_equality(self, name: str, one: int, two: int, numbers: Float[np.ndarray, " k"]) -> None:
+        if one not in self.coordinates or (two >= 0 and two not in self.coordinates):
+            self.unsupported.append(f"equality {name!r} of a joint that has not one coordinate")
+        else:
+            other = self.coordinates[two] if two >= 0 else None
+            self.joints.append(contacts.coupling(self.coordinates[one], other, numbers[:5], name=name))
+
+    def left_out(self) -> Iterator[str]:
+        """What is no part of a mechanism, by name."""
+        model = self.model
+        limited = [self._name("joint", int(j)) for j in np.flatnonzero(model.jnt_limited)]
+        touching = [
+            self._name("geom", int(k))
+            for k in np.flatnonzero(np.logical_or(model.geom_contype, model.geom_conaffinity))
+        ]
+        disabled = model.opt.disableflags & self.mujoco.mjtDisableBit.mjDSBL_CONTACT
+        driven = [self._name("actuator", k) for k in range(model.nu)]
+        idle = [self._name("equality", int(k)) for k in np.flatnonzero(~model.eq_active0.astype(bool))]
+        for what, names in (
+            ("limits of", limited),
+            ("contacts of", [] if disabled else touching),
+            ("actuators", driven),
+            ("inactive equalities", idle),
+        ):
+            if names:
+                yield f"{what} {', '.join(map(repr, names))}"

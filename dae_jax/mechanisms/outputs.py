@@ -1,0 +1,153 @@
+"""What a mechanism's solution shows: coordinates, efforts, reactions, power."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .. import diagnostics
+from ..solution import DAESolution, without_padding
+from ..types import Args, Time
+from .bodies import GROUND, wrench
+from .configuration import Configuration, Coordinate
+from .contacts import Coupling, Motion
+from .joints import AbstractJoint
+from .loads import AbstractLoad, Along, Applied
+from .rotations import moment, rotate_back
+
+
+if TYPE_CHECKING:
+    from .mechanism import Mechanism
+
+
+def bodies_of(element: AbstractJoint | AbstractLoad) -> set[str]:
+    """The bodies that a joint or a load names."""
+    if isinstance(element, Applied):
+        return {element.body}
+    on = [element.coordinate if isinstance(element, Along) else element]
+    if isinstance(element, Coupling) and element.second is not None:
+        on.append(element.second)
+    return {x.body for part in on if isinstance(part, AbstractJoint | Coordinate) for x in (part.on_a, part.on_b)}
+
+
+def coordinate_named(mechanism: "Mechanism", name: str) -> Coordinate:
+    """That of a joint or a load, "joint.angle" where a joint has several."""
+    along = {load.name: load.coordinate for load in mechanism.loads if isinstance(load, Along)}
+    known: dict[str, Coordinate] = dict(along)
+    for joint in mechanism.joints:
+        found = joint.coordinates
+        known |= {f"{joint.name}.{kind}": c for kind, c in found.items()}
+        if len(found) == 1:
+            known |= {joint.name: next(iter(found.values()))}
+    if name not in known:
+        raise ValueError(f"There is no coordinate {name!r}; there are {', '.join(map(repr, known)) or 'none'}.")
+    return known[name]
+
+
+def coordinate(mechanism: "Mechanism", sol: DAESolution, name: str) -> Float[Array, " times"]:
+    """c at each saved time."""
+    c = coordinate_named(mechanism, name)
+    values = _at_saved_times(mechanism, sol, lambda t, at, args: c(at))
+    return jnp.unwrap(values) if c.kind == "angle" and mechanism.dimension == 3 else values
+
+
+def rate(mechanism: "Mechanism", sol: DAESolution, name: str) -> Float[Array, " times"]:
+    """ċ at each saved time."""
+    c = coordinate_named(mechanism, name)
+    return _at_saved_times(mechanism, sol, lambda t, at, args: c.with_rate(at)[1])
+
+
+def effort(mechanism: "Mechanism", sol: DAESolution, name: str) -> Float[Array, " times"]:
+    """τ at each saved time."""
+    for load in mechanism.loads:
+        if load.name == name and isinstance(load, Along):
+            return _at_saved_times(mechanism, sol, load.effort)
+    for joint in mechanism.joints:
+        if joint.name == name and isinstance(joint, Motion):
+            (row,), _ = mechanism.rows()[name]
+            # g grows with c at the rate 1 where it is 0, and pulls by −λ.
+            return -diagnostics.multipliers(mechanism.system(), sol)[..., row]
+    known = [x.name for x in (*mechanism.loads, *mechanism.joints) if isinstance(x, Along | Motion)]
+    raise ValueError(
+        f"There is no motor, spring or damper {name!r}; there are {', '.join(map(repr, known)) or 'none'}."
+    )
+
+
+def reaction(
+    mechanism: "Mechanism", sol: DAESolution, name: str, axes: Literal["world", "body"]
+) -> tuple[Float[Array, "times d"], Float[Array, "times *d"]]:
+    """Force and moment on the second body of a joint, at its point there."""
+    joint = next((joint for joint in mechanism.joints if joint.name == name), None)
+    if joint is None:
+        raise ValueError(f"There is no joint {name!r}; there are {', '.join(repr(j.name) for j in mechanism.joints)}.")
+    if axes not in ("world", "body"):
+        raise ValueError(f"`axes` must be 'world' or 'body', but is {axes!r}.")
+    system = mechanism.system()
+    multipliers = diagnostics.multipliers(system, sol)
+    holonomic = multipliers.shape[-1] - sum(len(h) for _, h in mechanism.rows().values())
+    g_rows, h_rows = mechanism.rows()[name]
+    lam, mu = multipliers[..., jnp.array(g_rows, int)], multipliers[..., jnp.array(h_rows, int) + holonomic]
+
+    def at_one(t: Time, y: Any, lam: Array, mu: Array, args: Args) -> tuple[Array, Array]:
+        q, v = y
+        at = mechanism.configuration(q, v)
+        _, pull = jax.vjp(lambda q: joint.constraint(t, mechanism.configuration(q), args), q)
+        _, pull_v = jax.vjp(lambda v: joint.nonholonomic(t, mechanism.configuration(q, v), args), v)
+        # Of a joint on the ground, the ground is what the first body acts on.
+        on, sign = (joint.on_b, 1.0) if joint.on_b.body != GROUND else (joint.on_a, -1.0)
+        generalised = -pull(lam)[0][on.body] - pull_v(mu)[0][on.body]
+        force, torque = wrench(q[on.body], generalised)
+        arm = joint.on_b.position(at) - at.pose(on.body).position
+        force, torque = sign * force, sign * (torque - moment(arm, force))
+        if axes == "body":
+            turn = at.pose(joint.on_b.body).rotation
+            return rotate_back(turn, force), rotate_back(turn, torque) if torque.ndim else torque
+        return force, torque
+
+    ts, ys = without_padding(sol.ts, sol.ys)
+    return _mapped(at_one, (ts, ys, lam, mu), sol.args)
+
+
+def energy(mechanism: "Mechanism", sol: DAESolution) -> Float[Array, " times"]:
+    """T + V."""
+    return diagnostics.energy(mechanism.system(), sol)
+
+
+def power(mechanism: "Mechanism", sol: DAESolution) -> dict[str, Float[Array, " times"]]:
+    """Q·v of each load without a potential, τ ċ of each motion that is given."""
+
+    def of_load(load: AbstractLoad) -> Callable[[Time, Configuration, Args], Array]:
+        def work(t: Time, at: Configuration, args: Args) -> Array:
+            assert at.v is not None
+            return jnp.sum(load.generalised_force(t, at, args) * at.v.values)
+
+        return work
+
+    at_start = mechanism.configuration(*mechanism.reference)
+    found = {
+        load.name: _at_saved_times(mechanism, sol, of_load(load))
+        for load in mechanism.loads
+        if load.energy(at_start) is None
+    }
+    for joint in mechanism.joints:
+        if isinstance(joint, Motion):
+            found[joint.name] = effort(mechanism, sol, joint.name) * rate(mechanism, sol, joint.name)
+    return found
+
+
+def _at_saved_times(
+    mechanism: "Mechanism", sol: DAESolution, of: Callable[[Time, Configuration, Args], Array]
+) -> Float[Array, " times"]:
+    """of(t, configuration, args) at each saved time."""
+    return _mapped(
+        lambda t, y, args: of(t, mechanism.configuration(*y), args), without_padding(sol.ts, sol.ys), sol.args
+    )
+
+
+@eqx.filter_jit
+def _mapped(of: Callable[..., Any], over: tuple[Any, ...], args: Args) -> Any:
+    """of(*row, args) for each row."""
+    return jax.vmap(lambda *row: of(*row, args))(*over)

@@ -1,0 +1,74 @@
+"""Rotations by unit quaternions e = (e₀, e₁, e₂, e₃), e₀ the scalar part, which turn body axes into world axes.
+
+Source: P. E. Nikravesh, *Computer-Aided Analysis of Mechanical Systems*, ch. 6 (Euler parameters); its L is E here.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+def matrix(e: Float[Array, "4"]) -> Float[Array, "3 3"]:
+    """R(e) = E₊ Eᵀ, homogeneous of degree 2 in e: a rotation where |e| = 1 (Nikravesh, eq. 6.19)."""
+    w, x, y, z = e
+    return jnp.stack(
+        [
+            jnp.stack([w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)]),
+            jnp.stack([2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)]),
+            jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z]),
+        ]
+    )
+
+
+def rates(e: Float[Array, "4"]) -> Float[Array, "3 4"]:
+    """E(e): ω = 2 E ė in body axes, ė = Eᵀω/2; E Eᵀ = 1 and E e = 0 where |e| = 1 (Nikravesh, eq. 6.48)."""
+    w, x, y, z = e
+    return jnp.stack([jnp.stack([-x, w, z, -y]), jnp.stack([-y, -z, w, x]), jnp.stack([-z, y, -x, w])])
+
+
+def rotate(r: Float[Array, "d d"], p: Float[Array, " d"]) -> Float[Array, " d"]:
+    """R p, as a sum, which becomes part of a kernel."""
+    return jnp.sum(r * p, 1)
+
+
+def rotate_back(r: Float[Array, "d d"], p: Float[Array, " d"]) -> Float[Array, " d"]:
+    """Rᵀ p."""
+    return jnp.sum(r * p[:, None], 0)
+
+
+def plane(angle: Float[Array, ""]) -> Float[Array, "2 2"]:
+    """The rotation of the plane by an angle."""
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    return jnp.stack([jnp.stack([c, -s]), jnp.stack([s, c])])
+
+
+def frame(axis: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """Columns x, y, z of a right-handed orthonormal frame with z along `axis`; the unit matrix for the z axis.
+
+    Source: T. Duff et al., *Building an Orthonormal Basis, Revisited*, JCGT 6 (2017).
+    """
+    x, y, z = axis / jnp.sqrt(jnp.sum(axis**2))
+    sign = jnp.where(z >= 0, 1.0, -1.0)
+    a = -1 / (sign + z)
+    b = x * y * a
+    first = jnp.stack([1 + sign * x * x * a, sign * b, -sign * x])
+    second = jnp.stack([b, sign + y * y * a, -y])
+    return jnp.stack([first, second, jnp.stack([x, y, z])], 1)
+
+
+def cross(spin: Float[Array, "..."], arm: Float[Array, " d"]) -> Float[Array, " d"]:
+    """ω × p, in space or in the plane, where ω is a number."""
+    if spin.ndim == 0:
+        return spin * jnp.stack([-arm[1], arm[0]])
+    (a, b, c), (x, y, z) = spin, arm
+    return jnp.stack([b * z - c * y, c * x - a * z, a * y - b * x])
+
+
+def moment(arm: Float[Array, " d"], force: Float[Array, " d"]) -> Float[Array, "..."]:
+    """p × F, a number in the plane."""
+    return cross(arm, force) if arm.shape[0] == 3 else arm[0] * force[1] - arm[1] * force[0]
+
+
+def quaternion(axis: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Array, "4"]:
+    """The unit quaternion of a turn by an angle in rad about an axis."""
+    unit = axis / jnp.sqrt(jnp.sum(axis**2))
+    return jnp.concatenate([jnp.cos(angle / 2)[None], jnp.sin(angle / 2) * unit])

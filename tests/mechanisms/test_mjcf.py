@@ -1,0 +1,87 @@
+"""MJCF files: what is read of them moves as MuJoCo moves it, better the smaller its step."""
+
+import diffrax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dae_jax
+from dae_jax import mechanisms as m
+
+
+mujoco = pytest.importorskip("mujoco", reason="MuJoCo, the extra [mjcf], is not installed")
+
+PENDULUM = """<mujoco><option gravity="0 0 -9.81" integrator="RK4"><flag contact="disable"/></option><worldbody>
+<body name="arm" pos="0 0 1"><joint name="hinge" axis="0 1 0.2" damping="0.1" stiffness="2" springref="10"/>
+<geom type="capsule" size=".05" fromto="0 0 0 .5 .1 0" mass="1"/>
+<body name="tip" pos=".5 0 .1"><geom size=".05" mass=".3"/></body></body></worldbody></mujoco>"""
+
+LOOP = """<mujoco><option gravity="0 0 -9.81"/><worldbody>
+<body name="left"><joint name="a" axis="0 1 0" range="-90 90" limited="true"/>
+<geom type="capsule" size=".05" fromto="0 0 0 0 0 1" mass="1"/>
+<body name="top" pos="0 0 1"><joint name="b" axis="0 1 0"/><geom type="capsule" size=".05" fromto="0 0 0 2 0 0" mass="1"/>
+</body></body>
+<body name="right" pos="2 0 0"><joint name="c" axis="0 1 0"/><geom type="capsule" size=".05" fromto="0 0 0 0 0 1" mass="1"/></body>
+</worldbody><equality><connect name="pin" body1="top" body2="right" anchor="2 0 0"/>
+<joint name="gear" joint1="a" joint2="c"/></equality><actuator><motor name="drive" joint="a"/></actuator></mujoco>"""
+
+
+@pytest.mark.slow
+def test_a_pendulum_moves_as_mujoco_moves_it():
+    mechanism = m.read_mjcf(PENDULUM)
+    times = np.linspace(0, 1, 11)
+    sol = dae_jax.daesolve(
+        mechanism.system(),
+        dae_jax.OrthogonalProjection(dae_jax.DOP853()),
+        0.0,
+        1.0,
+        None,
+        mechanism.assemble(),
+        saveat=diffrax.SaveAt(ts=jnp.asarray(times)),
+        stepsize_controller=diffrax.PIDController(rtol=1e-12, atol=1e-12),
+    )
+    ours, off = np.asarray(mechanism.coordinate(sol, "hinge")), []
+    model = mujoco.MjModel.from_xml_string(PENDULUM)
+    for step in (1e-2, 5e-3, 2.5e-3):
+        model.opt.timestep = step
+        data, theirs = mujoco.MjData(model), [0.0]
+        for _ in times[1:]:
+            mujoco.mj_step(model, data, nstep=round(0.1 / step))
+            theirs.append(float(data.qpos[0]))
+        off.append(np.abs(ours - theirs).max())
+    assert off[2] < 1e-7
+    assert off[0] / off[1] > 8
+    assert off[1] / off[2] > 8
+
+
+@pytest.mark.slow
+def test_a_loop_is_closed_and_what_is_left_out_is_named():
+    with pytest.warns(UserWarning, match=r"limits of 'a'; contacts of .*; actuators 'drive'"):
+        mechanism = m.read_mjcf(LOOP)
+    assert [body.name for body in mechanism.bodies] == ["left", "top", "right"]
+    y0 = mechanism.assemble(rates={"c": 1.0})
+    # A parallelogram: one degree of freedom, of 21 coordinates.
+    assert mechanism.rank(y0)[0] == 20
+    at = mechanism.configuration(*y0)
+    rates = {joint.name: joint.angle.with_rate(at)[1] for joint in mechanism.joints if joint.name in "abc"}
+    assert np.allclose([rates["a"], rates["b"], rates["c"]], [1.0, -1.0, 1.0])
+
+
+def test_all_that_is_not_supported_is_listed():
+    model = """<mujoco><worldbody><body name="a"><joint name="h" armature="0.1"/><joint name="s" type="slide"/>
+    <joint name="r"/><geom size=".1"/></body><body name="b"><joint name="g" frictionloss="1" armature="2"/><geom size=".1"/></body>
+    </worldbody><tendon><fixed name="t"><joint joint="g" coef="1"/></fixed></tendon></mujoco>"""
+    with pytest.raises(ValueError, match="1 tendons") as refusal:
+        m.read_mjcf(model)
+    for part in ("'h', 's', 'r' of body 'a' together", "armature of joint 'g'", "frictionloss of joint 'g'"):
+        assert part in str(refusal.value)
+
+
+def test_urdf_is_read():
+    urdf = """<robot name="r"><link name="base"/><link name="arm"><inertial><origin xyz="0 0 0.5"/><mass value="1"/>
+    <inertia ixx="0.1" iyy="0.1" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+    <joint name="j" type="continuous"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/></joint></robot>"""
+    mechanism = m.read_mjcf(urdf)
+    assert [body.name for body in mechanism.bodies] == ["arm"]
+    assert np.allclose(mechanism.bodies[0].at, (0, 0, 0.5))
+    assert [joint.name for joint in mechanism.joints] == ["j"]

@@ -1,0 +1,79 @@
+"""What cannot be a mechanism is refused in a sentence that names it."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dae_jax import mechanisms as m
+
+
+ROD = m.Body("rod", 1.0, 0.1)
+BLOCK = m.Body("block", 1.0, (0.1, 0.1, 0.1))
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: m.Body("rod", 0.0, 0.1), "Body 'rod' has the mass 0"),
+        (lambda: m.Body("rod", 1.0, -0.1), "Body 'rod' has the inertia -0.1"),
+        (lambda: m.Body("rod", 1.0, (0.1, 0.1, 0.0)), "thin rod"),
+        (lambda: m.Body("rod", 1.0, (0.1, 0.1)), "`inertia` must be a number or"),
+        (lambda: m.Body("ground", 1.0, 0.1), "needs a name"),
+        (lambda: m.Body("rod", 1.0, 0.1, at=(0, 0, 0)), "`at` must be"),
+        (lambda: m.revolute(ROD, ROD, (0, 0)), "'rod' and itself"),
+        (lambda: m.prismatic(m.ground, ROD, axis=(0, 0), name="slider"), "'slider' has an axis of length 0"),
+        (lambda: m.revolute(m.ground, ROD), "'ground-rod': give either `at`"),
+        (lambda: m.revolute(m.ground, BLOCK, (0, 0, 0)), "needs an axis"),
+        (lambda: m.spherical(m.ground, ROD, (0, 0)), "'ground' and 'rod' are planar"),
+        (lambda: m.revolute(ROD, BLOCK, (0, 0)), "one is planar and one is spatial"),
+        (lambda: m.universal(m.ground, BLOCK, (0, 0, 0), axes=((1, 0, 0), (1, 1, 0))), "must be perpendicular"),
+        (lambda: m.distance(m.ground, ROD, ((0, 0), (0, 0))), "`length` must be a positive number"),
+        (lambda: m.motor(m.revolute(m.ground, ROD, (0, 0))), "either a `torque` or a `motion`"),
+        (lambda: m.spring(m.spherical(m.ground, BLOCK, (0, 0, 0)), 1.0), "no coordinate"),
+        (lambda: m.spring(m.cylindrical(m.ground, BLOCK, axis=(1, 0, 0)), 1.0), "say which"),
+        (lambda: m.Mechanism([ROD, ROD]), "Two bodies have the name 'rod'"),
+        (lambda: m.Mechanism([ROD, BLOCK]), "'rod' is planar and body 'block' is spatial"),
+        (lambda: m.Mechanism([BLOCK], [m.revolute(m.ground, ROD, (0, 0))]), "on the body 'rod', which is none"),
+        (lambda: m.Mechanism([ROD], [m.revolute(m.ground, ROD, (0, 0))] * 2), "'ground-rod': give one"),
+        (lambda: m.Mechanism([ROD]).assemble({"crank": (0, 0, 0)}), "'crank', which is no body"),
+        (lambda: m.Mechanism([ROD]).assemble({"rod": (0, 0)}), "must be 3 numbers"),
+        (
+            lambda: m.Mechanism([ROD], [m.revolute(m.ground, ROD, (0, 0))]).assemble(at={"hinge": 1.0}),
+            "no coordinate 'hinge'",
+        ),
+    ],
+)
+def test_what_is_wrong_is_named(make, said: str):
+    with pytest.raises(ValueError, match=said):
+        make()
+
+
+def test_a_loop_that_cannot_close_is_named_with_its_gap():
+    """Two rods of length 1 between points 2.5 apart."""
+    one, two = m.Body("one", 1.0, 0.1, at=(0.5, 0)), m.Body("two", 1.0, 0.1, at=(1.5, 0.1))
+    joints = [
+        m.revolute(m.ground, one, anchors=((0, 0), (-0.5, 0)), name="left"),
+        m.revolute(one, two, anchors=((0.5, 0), (-0.5, 0)), name="middle"),
+        m.revolute(m.ground, two, anchors=((2.5, 0), (0.5, 0)), name="right"),
+    ]
+    with pytest.raises(ValueError, match=r"joint 'right' stays open by 0\.5\b"):
+        m.Mechanism([one, two], joints).assemble()
+
+
+def test_a_rate_that_no_joint_allows_is_refused():
+    hinge = m.revolute(m.ground, ROD, (0, 0), name="hinge")
+    held = m.Mechanism([ROD], [hinge], [m.motor(hinge, motion=lambda t, args: 0.0 * t)])
+    with pytest.raises(ValueError, match="the values in `rates` contradict"):
+        held.assemble(rates={"hinge": 1.0})
+
+
+def test_names_of_outputs():
+    mechanism = m.Mechanism([ROD], [m.revolute(m.ground, ROD, (0, 0), name="hinge")])
+    q, _ = mechanism.reference
+    with pytest.raises(KeyError, match="no body 'crank'"):
+        q["crank"]
+    with pytest.raises(ValueError, match="no joint 'pin'; there are 'hinge'"):
+        mechanism.reaction(None, "pin")
+    with pytest.raises(ValueError, match="no motor, spring or damper 'motor'"):
+        mechanism.effort(None, "motor")
+    assert np.shape(jnp.asarray(q["rod"])) == (3,)
