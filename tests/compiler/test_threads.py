@@ -167,7 +167,8 @@ class TestThreads:
             "    call(xs).block_until_ready()\n"
             "    spent = [t - before.get(k, 0) for k, t in times().items()]\n"
             "    return sum(t > 0.05 * sum(spent) for t in spent)\n"
-            "every = threads()\n"
+            # On a machine that is busy a thread may find nothing left to do.
+            "every = max(threads() for _ in range(20))\n"
             "with configure(threads=1): single = threads()\n"
             "os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:1])\n"
             "print(every, single, threads())"
