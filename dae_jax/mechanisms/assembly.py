@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +15,7 @@ from ..consistent import consistent_state
 from ..systems import ConstrainedSystem
 from ..types import Args, Time
 from .bodies import GROUND, numbers
-from .configuration import Coordinates
+from .configuration import Coordinate, Coordinates
 from .outputs import coordinate_named
 
 
@@ -103,38 +104,48 @@ def _with_values(
     system = mechanism.system()
     if not at and not rates:
         return system
-    held = {name: coordinate_named(mechanism, name) for name in (*at, *rates)}
-
-    def off(name: str, q: Coordinates) -> Array:
-        c, configuration = held[name], mechanism.configuration(q)
-        if c.kind == "angle" and mechanism.dimension == 3:
-            sine, cosine = c.direction(configuration)
-            return jnp.arctan2(
-                sine * jnp.cos(at[name]) - cosine * jnp.sin(at[name]),
-                cosine * jnp.cos(at[name]) + sine * jnp.sin(at[name]),
-            )
-        return c(configuration) - at[name]
-
-    def constraint(t: Time, q: Coordinates, args: Args) -> Array:
-        # What has a rate beside a value moves on from it.
-        extra = [off(name, q) - rates.get(name, 0.0) * (t - t0) for name in at]
-        rows = [] if system.constraint is None else [mechanism.constraint(t, q, args)]
-        return jnp.concatenate([*rows, *(jnp.reshape(x, 1) for x in extra)])
-
-    def nonholonomic(t: Time, q: Coordinates, v: Coordinates, args: Args) -> Array:
-        configuration = mechanism.configuration(q, v)
-        extra = [held[name].with_rate(configuration)[1] - rate for name, rate in rates.items() if name not in at]
-        rows = [] if system.nonholonomic is None else [mechanism.nonholonomic(t, q, v, args)]
-        return jnp.concatenate([*rows, *(jnp.reshape(x, 1) for x in extra)])
-
+    held = _Held(
+        mechanism,
+        {name: coordinate_named(mechanism, name) for name in (*at, *rates)},
+        {name: numbers(value) for name, value in at.items()},
+        {name: numbers(value) for name, value in rates.items()},
+        jnp.asarray(t0),
+    )
     has_rates = system.nonholonomic is not None or set(rates) - set(at)
     has_positions = system.constraint is not None or at
     return ConstrainedSystem(
         system.force,
-        constraint if has_positions else None,
+        held.constraint if has_positions else None,
         system.mass,
-        nonholonomic if has_rates else None,
+        held.nonholonomic if has_rates else None,
     )
+
+
+class _Held(eqx.Module):
+    """A mechanism whose coordinates have these values at t₀, and move on from them at these rates. A module, so that `jit` and
+    derivatives find the numbers in it.
+    """
+
+    mechanism: "Mechanism"
+    coordinates: dict[str, Coordinate]
+    at: dict[str, Array]
+    rates: dict[str, Array]
+    t0: Array
+
+    def constraint(self, t: Time, q: Coordinates, args: Args) -> Array:
+        """The mechanism's equations of positions, and c − c₀ − ċ₀ (t − t₀)."""
+        configuration = self.mechanism.configuration(q)
+        wanted = {name: c + self.rates.get(name, 0.0) * (t - self.t0) for name, c in self.at.items()}
+        extra = [self.coordinates[name].off(configuration, c) for name, c in wanted.items()]
+        rows = [] if self.mechanism.system().constraint is None else [self.mechanism.constraint(t, q, args)]
+        return jnp.concatenate([*rows, *(jnp.reshape(x, 1) for x in extra)])
+
+    def nonholonomic(self, t: Time, q: Coordinates, v: Coordinates, args: Args) -> Array:
+        """Those of velocities, and ċ − ċ₀ of what has a rate and no value."""
+        configuration, free = self.mechanism.configuration(q, v), self.rates.keys() - self.at.keys()
+        extra = [self.coordinates[name].with_rate(configuration)[1] - self.rates[name] for name in sorted(free)]
+        rows = [] if self.mechanism.system().nonholonomic is None else [self.mechanism.nonholonomic(t, q, v, args)]
+        return jnp.concatenate([*rows, *(jnp.reshape(x, 1) for x in extra)])
 
 
 def _gaps(
@@ -197,6 +208,6 @@ def _message(gaps: dict[str, float], allowed: float) -> str:
     others = "".join(f"\n  {name!r} by {gap:.6g}" for gap, name in still_open[1:])
     return (
         f"The mechanism cannot be assembled from this guess: joint {worst!r} stays open by {gap:.6g} when all others are closed as "
-        "far as they can be (m, or the sine of an angle). Bodies are too short or too long for this loop, or the guess is "
+        "far as they can be (m, or rad of an angle). Bodies are too short or too long for this loop, or the guess is "
         "too far off." + (f"\nAlso open:{others}" if others else "")
     )

@@ -238,13 +238,22 @@ def _shaped(name: str, what: str, value: Numbers, shapes: tuple[tuple[int, ...],
 
 
 def _refuse_no_mass(body: Body) -> None:
+    for what in ("mass", "inertia", "at", "orientation", "velocity", "spin"):
+        value = getattr(body, what)
+        if not isinstance(value, Tracer) and not np.all(np.isfinite(value)):
+            raise ValueError(f"Body {body.name!r}: `{what}` is not finite: {np.asarray(value).tolist()}.")
     if not isinstance(body.mass, Tracer) and not body.mass > 0:
         raise ValueError(f"Body {body.name!r} has the mass {float(body.mass):g}, and must have a positive one.")
     if isinstance(body.inertia, Tracer):
         return
     j = np.atleast_2d(np.asarray(body.inertia))
-    if not (np.allclose(j, j.T, rtol=0, atol=1e-6 * np.abs(j).max()) and np.linalg.eigvalsh(j)[0] > 0):
+    moments = np.linalg.eigvalsh(j)
+    if not (np.allclose(j, j.T, rtol=0, atol=1e-6 * np.abs(j).max()) and moments[0] > 0):
         raise ValueError(
             f"Body {body.name!r} has the inertia {np.asarray(body.inertia).tolist()}, and must have one that is positive "
             "(symmetric, with positive principal moments); give a thin rod a little about its axis."
+        )
+    if len(moments) == 3 and moments[2] > (1 + 1e-6) * (moments[0] + moments[1]):
+        raise ValueError(
+            f"Body {body.name!r} has the principal moments {moments.tolist()}: of no body is one larger than the sum of the others."
         )

@@ -130,10 +130,19 @@ class Coordinate(eqx.Module):
         c = lambda qa, qb: value(self.kind, qa, qb, self.on_a.arrays, self.on_b.arrays)
         return jax.jvp(c, (at.rows[a], at.rows[b]), (at.velocities[a], at.velocities[b]))
 
-    def direction(self, at: Configuration) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Sine and cosine of an angle in space."""
+    @property
+    def is_turn(self) -> bool:
+        """Whether it is an angle in space, whose whole turns are not known."""
+        return self.kind == "angle" and self.on_a.point.shape[0] == 3
+
+    def off(self, at: Configuration, wanted: Float[Array, ""]) -> Float[Array, ""]:
+        """c − wanted; of an angle in space within (−π, π], smooth where it is near 0, whatever turns there have been."""
+        if not self.is_turn:
+            return self(at) - wanted
         x = self.on_b.axis(at, 0)
-        return jnp.sum(x * self.on_a.axis(at, 1)), jnp.sum(x * self.on_a.axis(at, 0))
+        sine, cosine = jnp.sum(x * self.on_a.axis(at, 1)), jnp.sum(x * self.on_a.axis(at, 0))
+        s, c = jnp.sin(wanted), jnp.cos(wanted)
+        return jnp.arctan2(sine * c - cosine * s, cosine * c + sine * s)
 
 
 def value(

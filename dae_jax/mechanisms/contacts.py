@@ -14,6 +14,10 @@ from .configuration import Configuration, Coordinate, Kind, Marker
 from .joints import AbstractJoint, Part, Points, dimension_of, frame_along, label_of, markers, only_coordinate, unit
 
 
+# A ratio counts as whole up to this.
+WHOLE = 1e-9
+
+
 class Distance(AbstractJoint):
     """A rod without mass between two points, (|d|² − ℓ²)/(2ℓ) = 0."""
 
@@ -95,8 +99,8 @@ class Rolling(AbstractJoint):
 
 
 class Motion(AbstractJoint):
-    """A motor whose motion is given: c(q) − motion(t) = 0 of an angle, a displacement or a distance c; of an angle in space its
-    sine, which is smooth for any number of turns.
+    """A motor whose motion is given: c(q) − motion(t) = 0 of an angle, a displacement or a distance c; of an angle in space
+    within (−π, π], which is smooth there for any number of turns.
     """
 
     name: str = eqx.field(static=True)
@@ -113,10 +117,7 @@ class Motion(AbstractJoint):
 
     def constraint(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
         wanted = jnp.reshape(jnp.asarray(self.motion(t, args)), ())
-        if self.coordinate.kind == "angle" and at.dimension == 3:
-            sine, cosine = self.coordinate.direction(at)
-            return (sine * jnp.cos(wanted) - cosine * jnp.sin(wanted))[None]
-        return (self.coordinate(at) - wanted)[None]
+        return self.coordinate.off(at, wanted)[None]
 
     def nonholonomic(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
         return jnp.zeros(0)
@@ -127,9 +128,7 @@ class Motion(AbstractJoint):
 
 
 class Coupling(AbstractJoint):
-    """Two coordinates that go together, c₁ = Σ aₖ c₂ᵏ: a gear, a rack, a screw. Of an angle in space it is the sine of the difference
-    that is 0: turns do not count, where c₂ is an angle too if a₁ is a whole number.
-    """
+    """Two coordinates that go together, c₁ = Σ aₖ c₂ᵏ: a gear, a rack, a screw. Whole turns of an angle c₁ in space do not count."""
 
     name: str = eqx.field(static=True)
     first: Coordinate
@@ -146,8 +145,7 @@ class Coupling(AbstractJoint):
 
     def constraint(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
         other = jnp.zeros(()) if self.second is None else self.second(at)
-        off = self.first(at) - jnp.polyval(self.coefficients[::-1], other)
-        return (jnp.sin(off) if self.first.kind == "angle" and at.dimension == 3 else off)[None]
+        return self.first.off(at, jnp.polyval(self.coefficients[::-1], other))[None]
 
     def nonholonomic(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
         return jnp.zeros(0)
@@ -170,11 +168,32 @@ def coupling(
 
     - `first`, `second`: joints with one coordinate, or their coordinates.
     - `coefficients`: (a₀, a₁, ...): (0, −2) is a gear of ratio 2 that turns the other way.
+
+    Errors: `ValueError` for an angle in space that would have to count its turns, which are not known there: c₂ may be one where
+    the coupling is linear and either c₁ is none, or a₁ or 1/a₁ is a whole number.
     """
     one, two = only_coordinate(first), None if second is None else only_coordinate(second)
-    label = f"coupling of {one.name}" if name is None else name
+    label, a = f"coupling of {one.name}" if name is None else name, jnp.atleast_1d(numbers(coefficients))
+    a = _without_zeros(a)
+    if two is not None and two.is_turn and len(a) > 1:
+        whole = lambda x: not isinstance(x, Tracer) and abs(x - round(float(x))) < WHOLE
+        if len(a) > 2 or (one.is_turn and not (whole(a[1]) or whole(1 / a[1]))):
+            raise ValueError(
+                f"Joint {label!r}: {two.name!r} has an angle in space, whose turns are not known: its powers and multiples that are not "
+                "whole (or 1 over a whole number) would change with each. In the plane any will do."
+            )
+        if not (one.is_turn and whole(a[1])):
+            # c₂ = (c₁ − a₀)/a₁ is the same, and smooth whatever turns c₂ has made.
+            one, two, a = two, one, jnp.stack([-a[0], jnp.ones_like(a[0])]) / a[1]
     # Its markers, fields of other joints, are those of its first coordinate.
-    return Coupling(label, one, two, jnp.atleast_1d(numbers(coefficients)))  # pyright: ignore[reportCallIssue]
+    return Coupling(label, one, two, a)  # pyright: ignore[reportCallIssue]
+
+
+def _without_zeros(a: Float[Array, " k"]) -> Float[Array, " k"]:
+    """Without the highest coefficients that are 0."""
+    while len(a) > 1 and not isinstance(a, Tracer) and a[-1] == 0:
+        a = a[:-1]
+    return a
 
 
 def distance(

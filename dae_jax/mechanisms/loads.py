@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..types import Args, Scalar, Time
@@ -20,6 +21,10 @@ from .configuration import Configuration, Coordinate, MarkerArrays, value
 from .contacts import Motion
 from .joints import AbstractJoint, only_coordinate
 from .rotations import rotate
+
+
+# Nearer to half a turn than this an angle in space may be on either side of it.
+HALF_TURN = np.pi - 0.1
 
 
 Pair: TypeAlias = tuple[Float[Array, " k"], Float[Array, " k"]]
@@ -67,13 +72,15 @@ class Law(eqx.Module):
 
 
 class Spring(Law):
-    """τ = −k (c − c₀)."""
+    """τ = −k (c − c₀); of an angle in space, whose turns are not known, NaN near half a turn, so that none passes it unseen."""
 
     stiffness: Float[Array, ""]
     rest: Float[Array, ""]
+    is_turn: bool = eqx.field(static=True)
 
     def effort(self, t: Time, c: Scalar, rate: Scalar, args: Args) -> Scalar:
-        return -self.stiffness * (c - self.rest)
+        known = (jnp.abs(c) < HALF_TURN) | (not self.is_turn)
+        return -self.stiffness * jnp.where(known, c - self.rest, jnp.nan)
 
     def energy(self, c: Scalar) -> Scalar | None:
         return self.stiffness * (c - self.rest) ** 2 / 2
@@ -189,13 +196,26 @@ def spring(
     - `on`: a joint, whose angle or displacement c is, or `between(a, b, ...)`, the distance of two points.
     - `stiffness`: k, in N/m or N m/rad.
     - `rest`: c₀, in m or rad.
+
+    An angle in space is within (−π, π] of the reference configuration, and its turns are not known: a solve in which one with a
+    spring comes near half a turn fails. In the plane turns count.
+
+    Errors: `ValueError` where the rest of an angle in space is half a turn off or more.
     """
-    return Along(_named("spring", on, name), only_coordinate(on), Spring(numbers(stiffness), numbers(rest)))
+    label, coordinate = _named("spring", on, name), only_coordinate(on)
+    law = Spring(_number(label, "stiffness", stiffness), _number(label, "rest", rest), coordinate.is_turn)
+    if law.is_turn and not isinstance(law.rest, Tracer) and abs(law.rest) >= HALF_TURN:
+        raise ValueError(
+            f"Spring {label!r}: the rest of an angle in space must be less than half a turn from the reference configuration, whose "
+            f"turns are not known, but is {float(law.rest):.6g} rad. Take another reference configuration."
+        )
+    return Along(label, coordinate, law)
 
 
 def damper(on: AbstractJoint | Coordinate, damping: Numbers, *, name: str | None = None) -> Along:
     """A linear damper, τ = −d ċ, with d in N s/m or N m s. `on` is as that of `spring`."""
-    return Along(_named("damper", on, name), only_coordinate(on), Friction(numbers(damping), None, jnp.ones(())))
+    label = _named("damper", on, name)
+    return Along(label, only_coordinate(on), Friction(_number(label, "damping", damping), None, jnp.ones(())))
 
 
 def friction(
@@ -215,8 +235,12 @@ def friction(
     - `viscous`: d.
     - `smoothing`: ε, in rad/s or m/s: below this speed dry friction creeps, where in truth it sticks. The smaller, the stiffer.
     """
-    law = Friction(numbers(viscous), numbers(coulomb), numbers(smoothing))
-    return Along(_named("friction", on, name), only_coordinate(on), law)
+    label = _named("friction", on, name)
+    given = (("viscous", viscous), ("coulomb", coulomb), ("smoothing", smoothing))
+    law = Friction(*(_number(label, what, value) for what, value in given))
+    if not isinstance(law.smoothing, Tracer) and not law.smoothing > 0:
+        raise ValueError(f"Load {label!r}: `smoothing` must be a positive speed, but is {smoothing}.")
+    return Along(label, only_coordinate(on), law)
 
 
 def motor(
@@ -231,7 +255,7 @@ def motor(
     **Arguments**
 
     - `on`: as that of `spring`.
-    - `torque`: in N m (N of a displacement), or `torque(t, c, rate, args)`, a controller.
+    - `torque`: in N m (N of a displacement), or `torque(t, c, rate, args)`, a controller; an angle c in space is within (−π, π].
     - `motion(t, args)`: the value of c at time t, a constraint; `Mechanism.effort` is what the motor needs for it.
 
     Errors: `ValueError` unless one of the two is given.
@@ -262,9 +286,12 @@ def force(
     - `at`: where it acts on the body, a point in the world in the reference configuration; its centre of mass if not given.
     - `axes`: whether the numbers are along the axes of the world or of the body.
     """
-    place = pose(body.reference[0])
-    point = jnp.zeros(body.dimension) if at is None else place.local(numbers(at))
-    return Applied(name or f"force on {body.name}", body.name, "force", axes, _value(value), point)
+    label, point = name or f"force on {body.name}", jnp.zeros(body.dimension)
+    if at is not None:
+        if numbers(at).shape != point.shape:
+            raise ValueError(f"Load {label!r}: `at` must have the shape {point.shape}, but has {numbers(at).shape}.")
+        point = pose(body.reference[0]).local(numbers(at))
+    return Applied(label, body.name, "force", _axes(label, axes), _value(value), point)
 
 
 def torque(
@@ -275,12 +302,25 @@ def torque(
     name: str | None = None,
 ) -> Applied:
     """A moment on a body, a number in N m in the plane, (3,) in space, or `value(t, q, v, args)`. Other arguments as those of `force`."""
-    zero = jnp.zeros(body.dimension)
-    return Applied(name or f"torque on {body.name}", body.name, "torque", axes, _value(value), zero)
+    label, zero = name or f"torque on {body.name}", jnp.zeros(body.dimension)
+    return Applied(label, body.name, "torque", _axes(label, axes), _value(value), zero)
 
 
 def _named(kind: str, on: AbstractJoint | Coordinate, name: str | None) -> str:
     return f"{kind} on {on.name}" if name is None else name
+
+
+def _number(label: str, what: str, value: Numbers) -> Float[Array, ""]:
+    number = numbers(value)
+    if number.ndim:
+        raise ValueError(f"Load {label!r}: `{what}` must be a number, but has the shape {number.shape}.")
+    return number
+
+
+def _axes(label: str, axes: Literal["world", "body"]) -> Literal["world", "body"]:
+    if axes not in ("world", "body"):
+        raise ValueError(f"Load {label!r}: `axes` must be 'world' or 'body', but is {axes!r}.")
+    return axes
 
 
 def _value(value: Numbers | Callable[..., Array]) -> Array | Callable[..., Array]:

@@ -17,7 +17,7 @@ from .bodies import GROUND, Body, inertial_force, mass_block
 from .configuration import Configuration, Coordinates
 from .drawing import drawing
 from .joints import AbstractJoint, Joint, pairs
-from .loads import AbstractLoad, Along, along
+from .loads import AbstractLoad, Along, Gravity, along
 
 
 class Mechanism(eqx.Module):
@@ -245,6 +245,8 @@ def _refuse_what_does_not_fit(mechanism: Mechanism, given: Sequence[AbstractJoin
             f"Body {planar[0]!r} is planar and body {spatial!r} is spatial: a mechanism is one or the other."
         )
     for x in given:
+        if isinstance(x, Gravity) and x.acceleration.shape != (mechanism.dimension,):
+            raise ValueError(f"{x.name!r} must have {mechanism.dimension} components, but has {x.acceleration.shape}.")
         for name in sorted(outputs.bodies_of(x) - {*names, GROUND}):
             raise ValueError(
                 f"{x.name!r} is on the body {name!r}, which is none of the mechanism's: {', '.join(names)}."

@@ -3,7 +3,7 @@
 import importlib
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -71,10 +71,15 @@ class _Reader:
         self.bodies = {int(i): body for i in np.unique(model.body_weldid) if i and (body := self._body(int(i)))}
         for i in self.bodies:
             self._joints_of(i)
-        for k in range(model.neq):
+        for k in range(model.neq if not self._disabled("EQUALITY") else 0):
             self._equality(k)
-        if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY and np.any(model.opt.gravity):
+        if not self._disabled("GRAVITY") and np.any(model.opt.gravity):
             self.loads.append(loads.gravity(model.opt.gravity))
+
+    def _disabled(self, *flags: str) -> bool:
+        """Whether one of these kinds of physics is switched off."""
+        bits = [getattr(self.mujoco.mjtDisableBit, f"mjDSBL_{flag}", 0) for flag in flags]
+        return any(self.model.opt.disableflags & int(bit) for bit in bits)
 
     def _name(self, kind: str, k: int) -> str:
         of = {"body": "BODY", "joint": "JOINT", "equality": "EQUALITY", "geom": "GEOM", "actuator": "ACTUATOR"}[kind]
@@ -161,15 +166,16 @@ class _Reader:
                 self.unsupported.append(f"{field.removeprefix('dof_')} of joint {name!r}")
         if np.any(getattr(model, "jnt_stiffnesspoly", np.zeros(model.njnt))[j]):
             self.unsupported.append(f"stiffnesspoly of joint {name!r}")
-        stiffness, damping = float(model.jnt_stiffness[j]), float(model.dof_damping[start])
+        stiffness = 0.0 if self._disabled("SPRING", "PASSIVE") else float(model.jnt_stiffness[j])
+        damping = 0.0 if self._disabled("DAMPER", "PASSIVE") else float(model.dof_damping[start])
         if j not in self.coordinates:
-            if stiffness or np.any(model.dof_damping[dofs]):
+            if stiffness or (not self._disabled("DAMPER", "PASSIVE") and np.any(model.dof_damping[dofs])):
                 self.unsupported.append(f"spring or damper of joint {name!r}, which is not along one coordinate")
             return
         if stiffness:
             k = int(model.jnt_qposadr[j])
             rest = model.qpos_spring[k] - model.qpos0[k]
-            self.loads.append(loads.spring(self.coordinates[j], stiffness, rest, name=f"spring of {name}"))
+            self._take(self.loads, loads.spring, self.coordinates[j], stiffness, rest, name=f"spring of {name}")
         if damping:
             self.loads.append(loads.damper(self.coordinates[j], damping, name=f"damper of {name}"))
 
@@ -212,7 +218,14 @@ class _Reader:
             self.unsupported.append(f"equality {name!r} of a joint that has not one coordinate")
         else:
             other = self.coordinates[two] if two >= 0 else None
-            self.joints.append(contacts.coupling(self.coordinates[one], other, numbers[:5], name=name))
+            self._take(self.joints, contacts.coupling, self.coordinates[one], other, numbers[:5], name=name)
+
+    def _take(self, parts: list[Any], make: Callable[..., Any], *arguments: object, **options: object) -> None:
+        """Adds what is made, or why it cannot be made to what is not supported."""
+        try:
+            parts.append(make(*arguments, **options))
+        except ValueError as refusal:
+            self.unsupported.append(str(refusal))
 
     def left_out(self) -> Iterator[str]:
         """What is no part of a mechanism, by name."""
@@ -222,7 +235,7 @@ class _Reader:
             self._name("geom", int(k))
             for k in np.flatnonzero(np.logical_or(model.geom_contype, model.geom_conaffinity))
         ]
-        disabled = model.opt.disableflags & self.mujoco.mjtDisableBit.mjDSBL_CONTACT
+        disabled = self._disabled("CONTACT")
         driven = [self._name("actuator", k) for k in range(model.nu)]
         idle = [self._name("equality", int(k)) for k in np.flatnonzero(~model.eq_active0.astype(bool))]
         for what, names in (

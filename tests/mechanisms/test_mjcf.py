@@ -85,3 +85,30 @@ def test_urdf_is_read():
     assert [body.name for body in mechanism.bodies] == ["arm"]
     assert np.allclose(mechanism.bodies[0].at, (0, 0, 0.5))
     assert [joint.name for joint in mechanism.joints] == ["j"]
+
+
+def test_what_is_switched_off_is_left_out():
+    held = '</worldbody><equality><joint joint1="hinge" polycoef="0.3 0 0 0 0"/></equality>'
+    text = PENDULUM.replace("</worldbody>", held)
+    found = m.read_mjcf(text)
+    assert (len(found.joints), len(found.loads)) == (2, 3)
+    off = 'contact="disable" spring="disable" damper="disable" equality="disable" gravity="disable"'
+    found = m.read_mjcf(text.replace('contact="disable"', off))
+    assert (len(found.joints), len(found.loads)) == (1, 0)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('springref="10"', 'springref="270"', "less than half a turn"),
+        (
+            "</worldbody>",
+            '</worldbody><equality><joint joint1="hinge" joint2="wheel" polycoef="0 0.3 0 0 0"/></equality>',
+            "turns",
+        ),
+    ],
+)
+def test_what_would_have_to_count_turns_is_refused(old, new, said):
+    wheel = '<body name="wheel" pos="3 0 1"><joint name="wheel" axis="0 0 1"/><geom size=".1" mass="1"/></body>'
+    with pytest.raises(ValueError, match=said):
+        m.read_mjcf(PENDULUM.replace('<body name="arm"', wheel + '<body name="arm"').replace(old, new))

@@ -9,6 +9,7 @@ from dae_jax import mechanisms as m
 
 ROD = m.Body("rod", 1.0, 0.1)
 BLOCK = m.Body("block", 1.0, (0.1, 0.1, 0.1))
+TURN = m.revolute(m.ground, BLOCK, (0, 0, 0), axis=(0, 0, 1))
 
 
 @pytest.mark.parametrize(
@@ -31,6 +32,18 @@ BLOCK = m.Body("block", 1.0, (0.1, 0.1, 0.1))
         (lambda: m.motor(m.revolute(m.ground, ROD, (0, 0))), "either a `torque` or a `motion`"),
         (lambda: m.spring(m.spherical(m.ground, BLOCK, (0, 0, 0)), 1.0), "no coordinate"),
         (lambda: m.spring(m.cylindrical(m.ground, BLOCK, axis=(1, 0, 0)), 1.0), "say which"),
+        (lambda: m.Body("rod", 1.0, (1.0, 1.0, 5.0)), "larger than the sum of the others"),
+        (lambda: m.Body("rod", np.inf, 0.1), "`mass` is not finite"),
+        (lambda: m.Body("rod", 1.0, 0.1, at=(np.nan, 0)), "`at` is not finite"),
+        (lambda: m.force(BLOCK, (0, 0, 1), axes="local"), "'world' or 'body', but is 'local'"),
+        (lambda: m.torque(BLOCK, (0, 0, 1), axes="Body"), "'world' or 'body', but is 'Body'"),
+        (lambda: m.force(BLOCK, (0, 0, 1), at=0.3), r"`at` must have the shape \(3,\)"),
+        (lambda: m.friction(TURN, 1.0, smoothing=0.0), "`smoothing` must be a positive speed"),
+        (lambda: m.spring(TURN, (1.0, 2.0)), "`stiffness` must be a number"),
+        (lambda: m.spring(TURN, 1.0, rest=3.1), "less than half a turn"),
+        (lambda: m.coupling(TURN, TURN, (0, 0.3)), "whose turns are not known"),
+        (lambda: m.coupling(TURN, TURN, (0, 1, 0.5)), "whose turns are not known"),
+        (lambda: m.Mechanism([ROD], loads=[m.gravity((0, 0, -9.81))]), "must have 2 components"),
         (lambda: m.Mechanism([ROD, ROD]), "Two bodies have the name 'rod'"),
         (lambda: m.Mechanism([ROD, BLOCK]), "'rod' is planar and body 'block' is spatial"),
         (lambda: m.Mechanism([BLOCK], [m.revolute(m.ground, ROD, (0, 0))]), "on the body 'rod', which is none"),

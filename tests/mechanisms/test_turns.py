@@ -1,0 +1,87 @@
+"""Angles in space, whose whole turns are not known: what is right all the same, and what says that it is not."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dae_jax
+from dae_jax import mechanisms as m
+
+
+ROD = m.Body("rod", 1.0, (0.1, 0.1, 0.01), at=(0.5, 0, 0))
+HINGE = m.revolute(m.ground, ROD, (0, 0, 0), axis=(0, 0, 1), name="hinge")
+SOLVER = dae_jax.OrthogonalProjection(diffrax.Tsit5())
+
+
+def angle_of(mechanism, q):
+    return float(HINGE.angle(mechanism.configuration(q)))
+
+
+@pytest.mark.parametrize("wanted", [2.0, -2.5, 2 * np.pi + 1])
+@pytest.mark.parametrize("held", ["motor", "coupling", "at"])
+def test_an_angle_that_is_given_is_taken_on_its_own_side(held, wanted):
+    parts = {
+        "motor": [m.motor(HINGE, motion=lambda t, args: wanted + 0 * t)],
+        "coupling": [m.coupling(HINGE, None, (wanted,))],
+        "at": [],
+    }
+    mechanism = m.Mechanism([ROD], [HINGE, *parts[held]])
+    q, _ = mechanism.assemble(at={"hinge": wanted} if held == "at" else None)
+    assert angle_of(mechanism, q) == pytest.approx((wanted + np.pi) % (2 * np.pi) - np.pi, abs=1e-9)
+
+
+def test_a_motor_holds_a_rod_beyond_a_right_angle():
+    motor = m.motor(HINGE, motion=lambda t, args: 2.0 + 0 * t, name="motor")
+    mechanism = m.Mechanism([ROD], [HINGE], [motor, m.gravity((0, -9.81, 0))])
+    sol = dae_jax.daesolve(mechanism.system(), SOLVER, 0.0, 0.5, None, mechanism.assemble())
+    np.testing.assert_allclose(mechanism.effort(sol, "motor"), 9.81 * 0.5 * np.cos(2.0), rtol=1e-9)
+
+
+def test_a_spring_fails_at_half_a_turn_and_is_right_before():
+    mechanism = m.Mechanism([ROD], [HINGE], [m.spring(HINGE, 1.0)])
+    rate, frequency = 8.0, np.sqrt(1 / 0.26)
+    y0 = mechanism.assemble(rates={"hinge": rate})
+    solve = lambda t1: dae_jax.daesolve(mechanism.system(), SOLVER, 0.0, t1, None, y0)
+    np.testing.assert_allclose(
+        mechanism.coordinate(solve(0.3), "hinge"), rate / frequency * np.sin(0.3 * frequency), rtol=1e-7
+    )
+    with pytest.raises(RuntimeError):
+        solve(1.5)
+
+
+@pytest.mark.parametrize(("ratio", "b"), [(2.0, 3.5), (-1.0, 4.0), (0.5, 3.5)])
+def test_gears_of_whole_ratios_turn_on(ratio, b):
+    other = m.Body("other", 1.0, (0.1, 0.1, 0.1), at=(0, 3, 0))
+    of_other = m.revolute(m.ground, other, (0, 3, 0), axis=(0, 0, 1), name="of other")
+    mechanism = m.Mechanism([ROD, other], [HINGE, of_other, m.coupling(HINGE, of_other, (0, ratio))])
+    turned = m.Mechanism([ROD, other], [HINGE, of_other]).assemble(at={"hinge": ratio * b, "of other": b})
+    np.testing.assert_allclose(mechanism.constraint(0.0, turned[0], None), 0, atol=1e-9)
+
+
+def test_a_screw_counts_no_turns():
+    nut = m.Body("nut", 1.0, (0.1, 0.1, 0.1))
+    screw = m.cylindrical(m.ground, nut, axis=(0, 0, 1), name="screw")
+    mechanism = m.Mechanism([nut], [screw, m.coupling(screw.displacement, screw.angle, (0.05, 0.1))])
+    for turn in (0.3, 4.0, 9.0):
+        q = mechanism.reference[0].put(
+            "nut", jnp.array([0, 0, 0.05 + 0.1 * turn, np.cos(turn / 2), 0, 0, np.sin(turn / 2)])
+        )
+        np.testing.assert_allclose(mechanism.constraint(0.0, q, None), 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("through", [lambda f: f, jax.jit], ids=["eager", "jit"])
+def test_derivatives_go_through_what_is_assembled(through):
+    def tip(design):
+        rod = m.Body("rod", 1.0, (0.1, 0.1, 0.01), at=jnp.stack([design["length"], jnp.zeros(()), jnp.zeros(())]))
+        hinge = m.revolute(m.ground, rod, (0, 0, 0), axis=(0, 0, 1), name="hinge")
+        q, v = m.Mechanism([rod], [hinge]).assemble(at={"hinge": design["angle"]}, rates={"hinge": design["rate"]})
+        return q["rod"][0] + v["rod"][1]
+
+    length, angle, rate = 0.5, 0.7, 3.0
+    found = through(jax.grad(tip))({"length": jnp.array(length), "angle": jnp.array(angle), "rate": jnp.array(rate)})
+    # x + ẏ = L cos θ + L ω cos θ.
+    assert found["length"] == pytest.approx((1 + rate) * np.cos(angle), rel=1e-9)
+    assert found["angle"] == pytest.approx(-(1 + rate) * length * np.sin(angle), rel=1e-9)
+    assert found["rate"] == pytest.approx(length * np.cos(angle), rel=1e-9)
