@@ -16,6 +16,7 @@ from ..systems import ConstrainedSystem
 from ..types import Args, Time
 from .bodies import GROUND, numbers
 from .configuration import Coordinate, Coordinates
+from .joints import Joint
 from .outputs import coordinate_named
 
 
@@ -38,8 +39,21 @@ def assembled(
     args: Args,
 ) -> tuple[Coordinates, Coordinates]:
     """The consistent state nearest to a guess, with these values of coordinates and rates."""
-    start = _start(mechanism, guess)
-    system = _with_values(mechanism, at, rates, t0)
+    found = _closed(mechanism, _with_values(mechanism, at, rates, t0), _start(mechanism, guess), t0, args)
+    if not isinstance(found[0].values, Tracer):
+        configuration = mechanism.configuration(found[0])
+        for joint in mechanism.joints:
+            if isinstance(joint, Joint) and joint.is_reversed(configuration):
+                raise ValueError(
+                    f"From this guess joint {joint.name!r} closes the wrong way round, its axes against each other: turn the bodies "
+                    "of the guess nearer to how they are to be."
+                )
+    return found
+
+
+def _closed(
+    mechanism: "Mechanism", system: ConstrainedSystem, start: tuple[Coordinates, Coordinates], t0: Time, args: Args
+) -> tuple[Coordinates, Coordinates]:
     try:
         return consistent_state(system, t0, start, args)
     except ValueError as refusal:

@@ -11,7 +11,8 @@ from jaxtyping import Array, Float
 from ..types import Args, Time
 from .bodies import Numbers, numbers, reference_pose
 from .configuration import Configuration, Coordinate, Kind, Marker
-from .joints import AbstractJoint, Part, Points, dimension_of, frame_along, label_of, markers, only_coordinate, unit
+from .joints import AbstractJoint, only_coordinate
+from .placement import Part, Points, dimension_of, frame_along, label_of, markers, unit
 
 
 # A ratio counts as whole up to this.
@@ -179,8 +180,8 @@ def coupling(
         whole = lambda x: not isinstance(x, Tracer) and abs(x - round(float(x))) < WHOLE
         if len(a) > 2 or (one.is_turn and not (whole(a[1]) or whole(1 / a[1]))):
             raise ValueError(
-                f"Joint {label!r}: {two.name!r} has an angle in space, whose turns are not known: its powers and multiples that are not "
-                "whole (or 1 over a whole number) would change with each. In the plane any will do."
+                f"Joint {label!r}: {two.name!r} has an angle in space, whose turns are not known: its powers, and multiples that are "
+                "not whole (or 1 over a whole number), would change with each. In the plane any will do."
             )
         if not (one.is_turn and whole(a[1])):
             # c₂ = (c₁ − a₀)/a₁ is the same, and smooth whatever turns c₂ has made.
@@ -190,7 +191,6 @@ def coupling(
 
 
 def _without_zeros(a: Float[Array, " k"]) -> Float[Array, " k"]:
-    """Without the highest coefficients that are 0."""
     while len(a) > 1 and not isinstance(a, Tracer) and a[-1] == 0:
         a = a[:-1]
     return a

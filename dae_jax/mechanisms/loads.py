@@ -20,11 +20,8 @@ from .bodies import Body, Numbers, generalised, numbers, pose
 from .configuration import Configuration, Coordinate, MarkerArrays, value
 from .contacts import Motion
 from .joints import AbstractJoint, only_coordinate
+from .laws import HALF_TURN, Drive, Friction, Law, Spring
 from .rotations import rotate
-
-
-# Nearer to half a turn than this an angle in space may be on either side of it.
-HALF_TURN = np.pi - 0.1
 
 
 Pair: TypeAlias = tuple[Float[Array, " k"], Float[Array, " k"]]
@@ -57,61 +54,6 @@ class Gravity(AbstractLoad):
 
     def energy(self, at: Configuration) -> Scalar | None:
         return -jnp.sum(at.masses[:, None] * self.acceleration * at.q.values[:, : at.dimension])
-
-
-class Law(eqx.Module):
-    """An effort τ(t, c, ċ), and the energy that it is from where it is from one."""
-
-    @abc.abstractmethod
-    def effort(self, t: Time, c: Scalar, rate: Scalar, args: Args) -> Scalar:
-        """τ."""
-
-    @abc.abstractmethod
-    def energy(self, c: Scalar) -> Scalar | None:
-        """V(c)."""
-
-
-class Spring(Law):
-    """τ = −k (c − c₀); of an angle in space, whose turns are not known, NaN near half a turn, so that none passes it unseen."""
-
-    stiffness: Float[Array, ""]
-    rest: Float[Array, ""]
-    is_turn: bool = eqx.field(static=True)
-
-    def effort(self, t: Time, c: Scalar, rate: Scalar, args: Args) -> Scalar:
-        known = (jnp.abs(c) < HALF_TURN) | (not self.is_turn)
-        return -self.stiffness * jnp.where(known, c - self.rest, jnp.nan)
-
-    def energy(self, c: Scalar) -> Scalar | None:
-        return self.stiffness * (c - self.rest) ** 2 / 2
-
-
-class Friction(Law):
-    """τ = −d ċ − τ_C tanh(ċ/ε)."""
-
-    viscous: Float[Array, ""]
-    coulomb: Float[Array, ""] | None
-    smoothing: Float[Array, ""]
-
-    def effort(self, t: Time, c: Scalar, rate: Scalar, args: Args) -> Scalar:
-        dry = 0 if self.coulomb is None else self.coulomb * jnp.tanh(rate / self.smoothing)
-        return -self.viscous * rate - dry
-
-    def energy(self, c: Scalar) -> Scalar | None:
-        return None
-
-
-class Drive(Law):
-    """τ = torque(t, c, ċ, args)."""
-
-    torque: Callable[..., Array] | Float[Array, ""]
-
-    def effort(self, t: Time, c: Scalar, rate: Scalar, args: Args) -> Scalar:
-        given = self.torque(t, c, rate, args) if callable(self.torque) else self.torque
-        return jnp.reshape(jnp.asarray(given), ()).astype(c.dtype)
-
-    def energy(self, c: Scalar) -> Scalar | None:
-        return None
 
 
 class Along(AbstractLoad):

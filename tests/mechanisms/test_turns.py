@@ -71,6 +71,12 @@ def test_a_screw_counts_no_turns():
         np.testing.assert_allclose(mechanism.constraint(0.0, q, None), 0, atol=1e-12)
 
 
+def test_a_joint_that_closes_the_wrong_way_round_is_named():
+    upside_down = jnp.array([0.5, 0, 0, np.cos(1.5), np.sin(1.5), 0, 0])
+    with pytest.raises(ValueError, match="joint 'hinge' closes the wrong way round"):
+        m.Mechanism([ROD], [HINGE]).assemble({"rod": upside_down})
+
+
 @pytest.mark.parametrize("through", [lambda f: f, jax.jit], ids=["eager", "jit"])
 def test_derivatives_go_through_what_is_assembled(through):
     def tip(design):

@@ -1,0 +1,77 @@
+"""Where a joint is on its two bodies: markers from points and axes in the world, or from points of the bodies."""
+
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from .bodies import Body, Ground, Numbers, numbers
+from .configuration import Marker, marker
+from .rotations import frame
+
+
+Part = Body | Ground
+Points = tuple[Numbers, Numbers]
+
+
+def markers(
+    a: Part, b: Part, label: str, at: Numbers | None, anchors: Points | None, axes: Float[Array, "d d"] | None = None
+) -> tuple[Marker, Marker]:
+    """Those of a joint on a and b, from a point in the world or from a point of each."""
+    d = dimension_of(a, b)
+    if (at is None) == (anchors is None):
+        raise ValueError(
+            f"Joint {label!r}: give either `at`, a point in the world, or `anchors`, a point of each body."
+        )
+    axes = jnp.eye(d) if axes is None else axes
+    if anchors is None:
+        assert at is not None
+        point = _vector(label, "at", at, d)
+        return marker(a, point, axes), marker(b, point, axes)
+    if len(anchors) != 2:
+        raise ValueError(f"Joint {label!r}: `anchors` must be two points, one of each body.")
+    local = [_vector(label, "anchors", p, d) for p in anchors]
+    on = [marker(body, jnp.zeros(d), axes) for body in (a, b)]
+    return on[0].moved_to(local[0]), on[1].moved_to(local[1])
+
+
+def dimension_of(a: Part, b: Part) -> Literal[2, 3]:
+    """2 for bodies in the plane, 3 in space."""
+    found = {body.dimension for body in (a, b) if isinstance(body, Body)}
+    if len(found) != 1:
+        what = "one is planar and one is spatial" if found else "neither moves"
+        raise ValueError(
+            f"A joint needs two bodies of one kind, or a body and the ground; of {a.name!r} and {b.name!r} {what}."
+        )
+    return 2 if found == {2} else 3
+
+
+def label_of(a: Part, b: Part, name: str | None) -> str:
+    """The name of what is between two bodies, which must not be the same."""
+    label = f"{a.name}-{b.name}" if name is None else name
+    if a.name == b.name:
+        raise ValueError(f"Joint {label!r} is between {a.name!r} and itself, and needs two bodies.")
+    return label
+
+
+def _vector(label: str, what: str, value: Numbers, d: int) -> Float[Array, " d"]:
+    array = numbers(value)
+    if array.shape != (d,):
+        raise ValueError(f"Joint {label!r}: `{what}` must be of {d} numbers, but has the shape {array.shape}.")
+    return array
+
+
+def unit(label: str, axis: Numbers, d: int) -> Float[Array, " d"]:
+    """The direction of an axis, which must have one."""
+    vector = _vector(label, "axis", axis, d)
+    length = jnp.sqrt(jnp.sum(vector**2))
+    if not isinstance(length, Tracer) and not (np.isfinite(length) and length > 0):
+        raise ValueError(f"Joint {label!r} has an axis of length {float(length):g}, which has no direction.")
+    return vector / length
+
+
+def frame_along(axis: Float[Array, " d"]) -> Float[Array, "d d"]:
+    """Columns with the axis first in the plane, last in space."""
+    return jnp.stack([axis, jnp.stack([-axis[1], axis[0]])], 1) if len(axis) == 2 else frame(axis)
