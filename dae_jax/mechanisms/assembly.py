@@ -39,7 +39,8 @@ def assembled(
     args: Args,
 ) -> tuple[Coordinates, Coordinates]:
     """The consistent state nearest to a guess, with these values of coordinates and rates."""
-    found = _closed(mechanism, _with_values(mechanism, at, rates, t0), _start(mechanism, guess), t0, args)
+    start = _start(mechanism, guess)
+    found = _closed(mechanism, _with_values(mechanism, at, rates, t0), start, t0, args)
     if not isinstance(found[0].values, Tracer):
         configuration = mechanism.configuration(found[0])
         for joint in mechanism.joints:
