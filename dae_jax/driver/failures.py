@@ -32,10 +32,12 @@ class SolveFailed(RuntimeError):
     """A solve failed in a compiled program (`jit`, `vmap`). JAX hands it on as the last line of an error of its own."""
 
 
-def in_words(sol: DAESolution, problem: Problem) -> str | None:
-    """Why a solve failed, at which time and after how many steps; `None` where it did not."""
-    start = eqx.combine(lax.stop_gradient(eqx.filter(problem, eqx.is_array)), problem)
-    return _sentence(tuple(map(np.asarray, lax.stop_gradient(_details(sol)))), _off(start))
+def in_words(sol: DAESolution, problem: Problem | None = None) -> str | None:
+    """Why a solve failed, at which time and after how many steps, and of a known `problem` what its start violates; `None` where
+    it did not.
+    """
+    off = problem and _off(eqx.combine(lax.stop_gradient(eqx.filter(problem, eqx.is_array)), problem))
+    return _sentence(tuple(map(np.asarray, lax.stop_gradient(_details(sol)))), off)
 
 
 def _details(sol: DAESolution) -> tuple[Any, ...]:
