@@ -88,10 +88,8 @@ def call(solve: "Solve", problem: Problem) -> tuple[Any, ...]:
     )
     saveat = dataclasses.replace(saveat, solver_state=True) if counts(solver) else saveat
     sums_errors = isinstance(controller, diffrax.ConstantStepSize) and not solve.recording
-    controller, passage = (
-        SummedErrors(controller) if sums_errors else controller,
-        passages(problem, solve.formulation.decode, not solve.keeps()[0]),
-    )
+    controller = SummedErrors(controller) if sums_errors else controller
+    passage = passages(problem, solve.formulation.decode, not solve.keeps()[0])
     controller = controller if passage is None else watched(controller, passage)
     if sums_errors or passage is not None:
         saveat = dataclasses.replace(saveat, controller_state=True)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from ..equations.manifold_ode import Equations
 from ..equations.mechanical import MechanicalODE
-from ..equations.regularity import drifted_over, turned_over
+from ..equations.regularity import passes_singularity
 from ..systems import is_mechanism
 from ..types import BoolScalar, Time, Y
 from .problem import Problem
@@ -33,9 +33,7 @@ class Passage(eqx.Module):
 
     def __call__(self, t0: Time, y0: Y, t1: Time, y1: Y, equations: Equations) -> BoolScalar:
         at = lambda t, y: self.ode.encode(self.decode(t, y, equations))
-        start, end = at(t0, y0), at(t1, y1)
-        passes = turned_over(self.ode, t0, start, t1, end)
-        return passes | drifted_over(self.ode, t1, end) if self.drifts else passes
+        return passes_singularity(self.ode, t0, at(t0, y0), t1, at(t1, y1), self.drifts)
 
 
 def passages(problem: Problem, decode: Callable[..., Any], drifts: bool) -> Passage | None:

@@ -209,20 +209,23 @@ def has_rank(ode: MechanicalODE, t: Time, y: Phase, rank: Rank | None) -> tuple[
     return fits, fits
 
 
-def turned_over(ode: MechanicalODE, t0: Time, y0: Phase, t1: Time, y1: Phase) -> Bool[Array, ""]:
+def passes_singularity(ode: MechanicalODE, t0: Time, y0: Phase, t1: Time, y1: Phase, drifts: bool) -> Bool[Array, ""]:
     """Whether det(G₁ M₀⁻¹ G₀ᵀ) < 0: between two flat states, the ends of a step, the gradients of the holonomic constraints (of as
-    many as are independent) have passed a configuration in which they depend on each other, or turned by over a right angle.
+    many as are independent) have passed a configuration in which they depend on each other, or turned by over a right angle. Of a
+    method that `drifts`, also whether the drift may have led past one.
     """
-    _, lifted, scale = _holonomic_gram(ode, t0, y0)
-    return _is_turned(ode, row_products(_gradients(ode, t1, y1), lifted), scale)
+    g0, g1 = _gradients(ode, t0, y0), _gradients(ode, t1, y1)
+    _, lifted, scale = _gram(ode, y0, g0)
+    turned = _is_turned(ode, row_products(g1, lifted), scale)
+    return turned | _drifted_over(ode, t1, y1, g1) if drifts else turned
 
 
-def drifted_over(ode: MechanicalODE, t: Time, y: Phase) -> Bool[Array, ""]:
+def _drifted_over(ode: MechanicalODE, t: Time, y: Phase, g: Float[Array, "m n"]) -> Bool[Array, ""]:
     """Whether the gradients G at a flat state and G′ at the nearest one on the constraints, q − M⁻¹Gᵀ(G M⁻¹Gᵀ)⁻¹g to first order,
     are as different as if a configuration in which they depend on each other were near: det(G M⁻¹Gᵀ + c (G′ − G) M⁻¹Gᵀ) < 0 for a
     large c, of either sign. The drift may then have led to another branch of the motion.
     """
-    gram, lifted, scale = _holonomic_gram(ode, t, y)
+    gram, lifted, scale = _gram(ode, y, g)
     rank = None if ode.rank is None else ode.rank[0]
     multipliers = scale * semidefinite_solve(gram * scale[:, None] * scale, scale * ode.constraint(t, y[0]), rank)
     change = row_products(_gradients(ode, t, (y[0] - matvec(lifted.T, multipliers), y[1])), lifted) - gram
@@ -233,9 +236,8 @@ def _gradients(ode: MechanicalODE, t: Time, y: Phase) -> Float[Array, "m n"]:
     return jax.jacfwd(ode.constraint, 1)(t, y[0])
 
 
-def _holonomic_gram(ode: MechanicalODE, t: Time, y: Phase) -> tuple[Array, Array, Array]:
+def _gram(ode: MechanicalODE, y: Phase, g: Float[Array, "m n"]) -> tuple[Array, Array, Array]:
     """G M⁻¹Gᵀ, G M⁻¹, and what makes the diagonal of the first 1."""
-    g = _gradients(ode, t, y)
     lifted = mass_solve(ode.mass(y[0]), g.T).T
     gram = row_products(g, lifted)
     return gram, lifted, unit_diagonal(gram)

@@ -152,15 +152,13 @@ class _Held(eqx.Module):
         configuration = self.mechanism.configuration(q)
         wanted = {name: c + self.rates.get(name, 0.0) * (t - self.t0) for name, c in self.at.items()}
         extra = [self.coordinates[name].off(configuration, c) for name, c in wanted.items()]
-        rows = [] if self.mechanism.system().constraint is None else [self.mechanism.constraint(t, q, args)]
-        return jnp.concatenate([*rows, *(jnp.reshape(x, 1) for x in extra)])
+        return jnp.concatenate([self.mechanism.constraint(t, q, args), *(jnp.reshape(x, 1) for x in extra)])
 
     def nonholonomic(self, t: Time, q: Coordinates, v: Coordinates, args: Args) -> Array:
         """Those of velocities, and ċ − ċ₀ of what has a rate and no value."""
         configuration, free = self.mechanism.configuration(q, v), self.rates.keys() - self.at.keys()
         extra = [self.coordinates[name].with_rate(configuration)[1] - self.rates[name] for name in sorted(free)]
-        rows = [] if self.mechanism.system().nonholonomic is None else [self.mechanism.nonholonomic(t, q, v, args)]
-        return jnp.concatenate([*rows, *(jnp.reshape(x, 1) for x in extra)])
+        return jnp.concatenate([self.mechanism.nonholonomic(t, q, v, args), *(jnp.reshape(x, 1) for x in extra)])
 
 
 def _gaps(

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from ..types import Args, Time
 from .bodies import Numbers, numbers, reference_pose
 from .configuration import Configuration, Coordinate, Kind, Marker
-from .joints import AbstractJoint, only_coordinate
+from .joints import AbstractHolonomicJoint, AbstractJoint, only_coordinate
 from .placement import Part, Points, dimension_of, frame_along, label_of, markers, unit
 
 
@@ -19,7 +19,7 @@ from .placement import Part, Points, dimension_of, frame_along, label_of, marker
 WHOLE = 1e-9
 
 
-class Distance(AbstractJoint):
+class Distance(AbstractHolonomicJoint):
     """A rod without mass between two points, (|d|² − ℓ²)/(2ℓ) = 0."""
 
     name: str = eqx.field(static=True)
@@ -31,15 +31,12 @@ class Distance(AbstractJoint):
         difference = self.on_b.position(at) - self.on_a.position(at)
         return (jnp.sum(difference**2)[None] - self.length**2) / (2 * self.length)
 
-    def nonholonomic(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
-        return jnp.zeros(0)
-
     @property
     def coordinates(self) -> dict[Kind, Coordinate]:
         return {}
 
 
-class OnCurve(AbstractJoint):
+class OnCurve(AbstractHolonomicJoint):
     """A point of b on a curve, or in space on a surface, of a: 0 = curve(p), p in the axes of a."""
 
     name: str = eqx.field(static=True)
@@ -49,9 +46,6 @@ class OnCurve(AbstractJoint):
 
     def constraint(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
         return jnp.ravel(jnp.asarray(self.curve(at.pose(self.on_a.body).local(self.on_b.position(at)))))
-
-    def nonholonomic(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
-        return jnp.zeros(0)
 
     @property
     def coordinates(self) -> dict[Kind, Coordinate]:
@@ -99,7 +93,7 @@ class Rolling(AbstractJoint):
         return {}
 
 
-class Motion(AbstractJoint):
+class Motion(AbstractHolonomicJoint):
     """A motor whose motion is given: c(q) − motion(t) = 0 of an angle, a displacement or a distance c; of an angle in space
     within (−π, π], which is smooth there for any number of turns.
     """
@@ -120,15 +114,12 @@ class Motion(AbstractJoint):
         wanted = jnp.reshape(jnp.asarray(self.motion(t, args)), ())
         return self.coordinate.off(at, wanted)[None]
 
-    def nonholonomic(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
-        return jnp.zeros(0)
-
     @property
     def coordinates(self) -> dict[Kind, Coordinate]:
         return {self.coordinate.kind: self.coordinate}
 
 
-class Coupling(AbstractJoint):
+class Coupling(AbstractHolonomicJoint):
     """Two coordinates that go together, c₁ = Σ aₖ c₂ᵏ: a gear, a rack, a screw. Whole turns of an angle c₁ in space do not count."""
 
     name: str = eqx.field(static=True)
@@ -147,9 +138,6 @@ class Coupling(AbstractJoint):
     def constraint(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
         other = jnp.zeros(()) if self.second is None else self.second(at)
         return self.first.off(at, jnp.polyval(self.coefficients[::-1], other))[None]
-
-    def nonholonomic(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
-        return jnp.zeros(0)
 
     @property
     def coordinates(self) -> dict[Kind, Coordinate]:

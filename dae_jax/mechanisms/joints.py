@@ -66,7 +66,14 @@ class AbstractJoint(eqx.Module):
         return self.coordinates[kind]
 
 
-class Joint(AbstractJoint):
+class AbstractHolonomicJoint(AbstractJoint):
+    """One all of whose equations are of positions."""
+
+    def nonholonomic(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
+        return jnp.zeros(0)
+
+
+class Joint(AbstractHolonomicJoint):
     """A lower pair: the displacement along some axes of a's frame is 0, and some axes of the two are perpendicular.
 
     - `locked`: the axes of a's frame along which p_b does not move.
@@ -91,9 +98,6 @@ class Joint(AbstractJoint):
 
     def constraint(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
         return pairs([self], at)
-
-    def nonholonomic(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
-        return jnp.zeros(0)
 
     def is_reversed(self, at: Configuration) -> bool:
         """Whether axes point against each other that go together: the equations, that they are perpendicular to others, allow both."""

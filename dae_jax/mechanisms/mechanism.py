@@ -100,7 +100,9 @@ class Mechanism(eqx.Module):
     def nonholonomic(self, t: Time, q: Coordinates, v: Coordinates, args: Args) -> Float[Array, " p"]:
         """h, of what rolls."""
         at = self.configuration(q, v)
-        return jnp.concatenate([joint.nonholonomic(t, at, args) for joint in self._others])
+        return jnp.concatenate(
+            [jnp.zeros(0, v.values.dtype), *(joint.nonholonomic(t, at, args) for joint in self._others)]
+        )
 
     def potential(self, q: Coordinates, args: Args) -> Scalar:
         """V, of gravity and springs."""

@@ -85,10 +85,9 @@ def reaction(
         raise ValueError(f"There is no joint {name!r}; there are {', '.join(repr(j.name) for j in mechanism.joints)}.")
     if axes not in ("world", "body"):
         raise ValueError(f"`axes` must be 'world' or 'body', but is {axes!r}.")
-    system = mechanism.system()
-    multipliers = diagnostics.multipliers(system, sol)
-    holonomic = multipliers.shape[-1] - sum(len(h) for _, h in mechanism.rows().values())
-    g_rows, h_rows = mechanism.rows()[name]
+    multipliers, rows = diagnostics.multipliers(mechanism.system(), sol), mechanism.rows()
+    holonomic = multipliers.shape[-1] - sum(len(h) for _, h in rows.values())
+    g_rows, h_rows = rows[name]
     lam, mu = multipliers[..., jnp.array(g_rows, int)], multipliers[..., jnp.array(h_rows, int) + holonomic]
 
     def at_one(t: Time, y: Any, lam: Array, mu: Array, args: Args) -> tuple[Array, Array]:
