@@ -24,6 +24,8 @@ from .validate.states import broadcast_to_state, refuse_wrong_state, with_rates
 from .validate.user_functions import refuse_wrong_functions
 
 
+# How many equations a message lists.
+LISTED = 12
 # What part of the interval a solve that failed is looked on beyond its end; and the second and third power of it.
 AHEAD = 1e-3
 # A smallest pivot below this power of round-off is that of constraints that become dependent.
@@ -86,7 +88,8 @@ class Unsolved(eqx.Module):
     def message(self) -> str:
         """Which equations are off, and by how much."""
         off = np.flatnonzero(~(np.abs(np.asarray(self.residuals)) <= np.asarray(self.allowed)))
-        lines = [f"  0 = {self.equations[i]} is off by {float(self.residuals[i]):.6g}" for i in off]
+        lines = [f"  0 = {self.equations[i]} is off by {float(self.residuals[i]):.6g}" for i in off[:LISTED]]
+        lines += [f"  and {len(off) - LISTED:,} more"] if len(off) > LISTED else []
         return "The initial state `y0` violates the equations, whatever its derivatives:\n" + "\n".join(lines)
 
 
@@ -109,7 +112,7 @@ def unsolved(system: System, t: Time, state: State, args: Args) -> Unsolved:
 
 
 def _left_over(ode: StructuralODE, t: Time, y: Float[Array, " N"]) -> Unsolved:
-    terms = jnp.sum(jnp.abs(ode.normals(t, y)), 1) * (1 + jnp.max(jnp.abs(y)))
+    terms = ode.sizes(t, y) * (1 + jnp.max(jnp.abs(y)))
     return Unsolved(ode.violations(t, y), jnp.finfo(y.dtype).eps ** 0.5 * terms, ode.invariant_names)
 
 

@@ -269,7 +269,7 @@ def _of_residual(
     linearised: LinearisedResidual, t0: Time, y: Flat, method: str, precision: str, compiled: dict[str, Any]
 ) -> ResidualPlan:
     structure, n = linearised.structure, y.size
-    by_y, by_rate = (n if c is None else len(c.seeds) for c in (structure.by_y, structure.by_rate))
+    by_y, by_rate = (n if c is None else c.count for c in (structure.by_y, structure.by_rate))
     colours = by_y, by_rate
     return ResidualPlan(
         method=method,

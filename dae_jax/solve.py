@@ -18,7 +18,7 @@ from .driver.problem import Problem, Program, split
 from .driver.program import KEPT, Solve, run, traces
 from .driver.resets import Reset, refuse_other_outputs
 from .driver.start import as_array, checked, refuse_bad_start, refuse_bad_times
-from .equations.residual_form import Form
+from .equations.residual_form import LARGE, Form
 from .formulations import (
     AbstractFormulation,
     Differentiation,
@@ -165,7 +165,10 @@ def _for_residuals(
     """The equations as they are written where the solver controls all their variables."""
     if is_mechanism(system):
         return Residual()
-    reason = _why_not_as_written(system, t0, y0, args, Residual(), solver.default_index)
+    size = sum(jnp.size(x) for x in jax.tree.leaves(y0))
+    # Dummy derivatives, which serve beyond the default, are not for many unknowns.
+    highest = solver.highest_index if size > LARGE else solver.default_index
+    reason = _why_not_as_written(system, t0, y0, args, Residual(), highest)
     return DummyDerivatives() if reason else Residual()
 
 

@@ -13,7 +13,7 @@ from .jaxprs.walk import (
     equations as equations,
     is_large as is_large,
 )
-from .jit import Jitted as Jitted, jit as jit
+from .jit import Jitted as Jitted, compiles as compiles, jit as jit
 from .kernel_call import Decision as Decision, decision as decision, hindrances as hindrances
 from .one_kernel import (
     PullBack as PullBack,

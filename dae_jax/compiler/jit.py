@@ -18,7 +18,7 @@ from .jaxprs.expansions import expanded
 from .jaxprs.scalar_interpreter import Unsupported
 from .kernel_call import called, without_mesh
 from .linear_map import Arrays, batched_alike, derivative_map, is_inexact
-from .settings import one_kernel_enabled
+from .settings import Settings, current, one_kernel_enabled
 
 
 def jit(
@@ -97,6 +97,19 @@ class Jitted:
             return eval_jaxpr(jaxpr.jaxpr, consts, *given)
 
         return jax.tree.unflatten(tree[0], _differentiable(closed)(*constants, *arrays))
+
+
+@functools.lru_cache(maxsize=256)
+def _compiles(jitted: Jitted, leaves: tuple[jax.ShapeDtypeStruct, ...], tree: Any, settings: Settings) -> bool:
+    return jitted.lower(*jax.tree.unflatten(tree, leaves)).compiler == settings.compiler == "llvm"
+
+
+def compiles(jitted: Jitted, *args: PyTree) -> bool:
+    """Whether our compiler makes one kernel of a call with arguments of these shapes (`jax.ShapeDtypeStruct`s), here and now."""
+    if not one_kernel_enabled() or jax.default_backend() != "cpu":
+        return False
+    leaves, tree = jax.tree.flatten(args)
+    return _compiles(jitted, tuple(leaves), tree, current())
 
 
 def _of_arrays(

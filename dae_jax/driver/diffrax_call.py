@@ -1,6 +1,7 @@
 """A solve as a call of `diffrax.diffeqsolve`, which sees the solver's state where the user sees his own."""
 
 import dataclasses
+import operator
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, cast
 
@@ -109,7 +110,7 @@ def call(solve: "Solve", problem: Problem) -> tuple[Any, ...]:
     stats = {**sol.stats, "end_time": end[0]}
     starts = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(y)]))
     result = RESULTS.where(starts, RESULTS.promote(sol.result), RESULTS.no_finite_start)
-    stats.update((name, getattr(sol.solver_state, name)) for name in counts(solver))
+    stats.update((path.split(".")[-1], operator.attrgetter(path)(sol.solver_state)) for path in counts(solver))
     state = lax.stop_gradient(cast(Any, sol.controller_state))
     state, passed = (state, False) if passage is None else (state.steps, state.passed)
     seen = state[-1] if sums_errors else None, passed

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Inexact
+from scipy.sparse import csr_array
 
 from ..compiler import Polynomial, polynomials
 from ..structure import (
@@ -84,6 +85,16 @@ class Offsets:
     def index(self) -> int:
         """The structural index: how often equations must be differentiated for the derivatives of all variables."""
         return max(self.indices, default=0)
+
+    @functools.cached_property
+    def occurrence(self) -> csr_array:
+        """The variables of each equation F̄ᵢ, with any of their derivatives."""
+        of_f = csr_array(self.by_y) + csr_array(self.by_rate)
+        if not self.combination.rows:
+            return of_f
+        terms = [(i, j) for i in range(of_f.shape[0]) for j, *_ in self.combination.terms(i)]
+        rows, columns = np.array(terms).T
+        return csr_array((np.ones(len(terms), bool), (rows, columns)), shape=of_f.shape) @ of_f
 
     @functools.cached_property
     def pattern(self) -> list[list[int]]:

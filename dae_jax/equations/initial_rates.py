@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from ..linalg import solve
 from ..structure import is_linear
 from ..types import DType, Flat, IntScalar, Scalar, Time
-from .residual_form import ResidualForm
+from .residual_form import LARGE, ResidualForm
 
 
 # Where ẏ is looked for, besides the guess: in directions at random, at these distances from it.
@@ -21,8 +21,8 @@ APART = 1e-4
 
 
 def is_nonlinear(form: object, dtype: DType) -> TypeGuard[ResidualForm]:
-    """Whether F depends on ẏ other than linearly."""
-    if not isinstance(form, ResidualForm) or not form.may_be_nonlinear:
+    """Whether F depends on ẏ other than linearly; what is large counts as linear, and is solved from what the user gave."""
+    if not isinstance(form, ResidualForm) or not form.may_be_nonlinear or form.size > LARGE:
         return False
     time, y = jax.ShapeDtypeStruct((), dtype), jax.ShapeDtypeStruct((form.size,), dtype)
     try:

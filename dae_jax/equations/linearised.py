@@ -2,44 +2,59 @@
 
 import dataclasses
 import functools
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Inexact, Int, PyTree
+from scipy.sparse import csr_array
 
 from ..linalg.dense import LOOPED
-from ..linalg.storage import Banded, Dense, Storage
+from ..linalg.sparse import Sparse
+from ..linalg.storage import Banded, Dense
 from ..structure import (
-    bandwidth,
     column_colouring,
     highest_value_transversal,
     reverse_cuthill_mckee,
-    seed_matrix,
     sigma_method,
     signature,
 )
-from ..types import Flat, IntScalar, Scalar, Time
+from ..types import DType, Flat, IntScalar, Scalar, Time
 from .derivative_orders import Combination, Offsets, find_offsets
 from .index1_form import Index1Form
 from .initial_rates import is_nonlinear, rates_of
 from .manifold_ode import at_one_instant
-from .residual_form import ResidualForm
+from .residual_form import LARGE, ResidualForm
 
+
+Storage: TypeAlias = Dense | Banded | Sparse
 
 GAUSS_NEWTON = 5
+# What a multiplication by a band, and one of sparse factors, costs, in parts of one of a dense matrix.
+BAND_COST, SPARSE_COST = 4, 16
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Compression:
-    """A Jacobian as the directional derivatives along `seeds`, and where its stored entries are among them (−1: 0)."""
+    """A Jacobian as directional derivatives, one for each colour of its columns, and where its stored entries are among them
+    (−1: 0).
+    """
 
-    seeds: Float[np.ndarray, "colours n"]
-    places: Int[np.ndarray, "n width"]
+    colours: Int[np.ndarray, " n"]
+    places: Int[np.ndarray, "*stored"]
 
-    def entries(self, compressed: Float[Array, "colours n"]) -> Float[Array, "n width"]:
+    @property
+    def count(self) -> int:
+        """How many colours there are."""
+        return int(self.colours.max(initial=-1)) + 1
+
+    def seeds(self, dtype: DType) -> Float[Array, "colours n"]:
+        """The directions."""
+        return (jnp.asarray(self.colours) == jnp.arange(self.count)[:, None]).astype(dtype)
+
+    def entries(self, compressed: Float[Array, "colours n"]) -> Float[Array, "*stored"]:
         """The stored entries."""
         return jnp.where(self.places >= 0, compressed.reshape(-1)[self.places], 0)
 
@@ -89,9 +104,9 @@ class LinearisedResidual(eqx.Module):
             full = np.ones((y.size, y.size), bool)
             rows = signature(full, full)
             found = Offsets(full, full, rows, sigma_method(rows))
-        patterns = found.by_y.tobytes(), found.by_rate.tobytes()
         indices = indices or found.indices
         offsets = found.sigma.variable_offsets
+        patterns = _Pattern.of(found.by_y), _Pattern.of(found.by_rate)
         return cls(form, _outline(*patterns, indices, offsets, found.index > 1, found.combination))
 
     @property
@@ -126,7 +141,7 @@ class LinearisedResidual(eqx.Module):
             return jax.jacfwd(self.form.residual, argument)(*point)
         of = lambda x: self.residual(*(x if k == argument else given for k, given in enumerate(point)))
         along = lambda seed: jax.jvp(of, (point[argument],), (seed,))[1]
-        return compression.entries(jax.vmap(along)(jnp.asarray(compression.seeds, point[1].dtype)))
+        return compression.entries(jax.vmap(along)(compression.seeds(point[1].dtype)))
 
     def factor(self, j: Array, m: Array, c: Inexact[Array, ""], h: Time) -> tuple[Any, Float[Array, ""]]:
         """The factors of J + c M, for c of the order of 1/h, and the smallest pivot, of round-off size for a singular one.
@@ -214,24 +229,42 @@ def powers(x: Float[Array, ""], exponents: tuple[int, ...]) -> Float[Array, " n"
     )
 
 
+class _Pattern(NamedTuple):
+    """Which entries of a square matrix may not be 0: rows of it one after the other, as a key of what was found."""
+
+    size: int
+    indices: bytes
+    starts: bytes
+
+    @classmethod
+    def of(cls, pattern: "Bool[np.ndarray, 'n n'] | csr_array") -> "_Pattern":
+        rows = csr_array(pattern)
+        rows.sort_indices()
+        return cls(rows.shape[0], rows.indices.astype(np.int64).tobytes(), rows.indptr.astype(np.int64).tobytes())
+
+    def whole(self) -> csr_array:
+        """As a matrix of truth values."""
+        columns, starts = (np.frombuffer(x, np.int64) for x in (self.indices, self.starts))
+        return csr_array((np.ones(len(columns), bool), columns, starts), shape=(self.size, self.size))
+
+
 @functools.lru_cache(maxsize=64)
 def _outline(
-    on_y: bytes,
-    on_rate: bytes,
+    on_y: _Pattern,
+    on_rate: _Pattern,
     indices: tuple[int, ...],
     offsets: tuple[int, ...],
     hidden: bool,
     combination: Combination,
 ) -> JacobianStructure:
-    n = len(indices)
-    by_y, by_rate = (np.frombuffer(x, bool).reshape(n, n) for x in (on_y, on_rate))
-    storage = _storage(by_y | by_rate, highest_value_transversal(signature(by_y, by_rate)))
-    small = n <= LOOPED
+    by_y, by_rate = on_y.whole(), on_rate.whole()
+    storage = _storage(by_y + by_rate, by_rate, highest_value_transversal(signature(by_y, by_rate)))
+    small = len(indices) <= LOOPED
     return JacobianStructure(
         storage,
         indices,
         offsets,
-        np.asarray(by_rate.any(0)),
+        np.bincount(by_rate.indices, minlength=len(indices)) > 0,
         hidden,
         combination if isinstance(storage, Dense) else Combination(),
         None if small else _compression(by_y, storage),
@@ -239,27 +272,34 @@ def _outline(
     )
 
 
-def _storage(pattern: Bool[np.ndarray, "n n"], transversal: list[int]) -> Storage:
-    """A band, with each equation in the place of its variable, where that is cheaper."""
-    n = len(pattern)
+def _storage(pattern: csr_array, by_rate: csr_array, transversal: list[int]) -> Storage:
+    """A band, with each equation in the place of its variable, or sparse factors, where that is cheaper."""
+    n = pattern.shape[0]
     if n <= LOOPED:
         return Dense(n)
-    equation_of = np.argsort(transversal)
-    paired = pattern[equation_of]
-    order = reverse_cuthill_mckee(paired | paired.T)
-    ordered = paired[np.ix_(order, order)]
-    lower, upper = bandwidth(np.tril(ordered)), bandwidth(np.triu(ordered))
-    if 4 * (lower + 1) * (lower + upper + 1) > n * n:
-        return Dense(n)
-    return Banded(equation_of[order], order, lower, upper)
+    pairing = np.array(transversal)
+    # In a band a whole solve is one kernel, but one that takes long to compile.
+    if n <= LARGE:
+        equation_of = np.argsort(pairing)
+        paired = pattern[equation_of]
+        order = reverse_cuthill_mckee(paired + paired.T)
+        rows, columns = paired[order][:, order].nonzero()
+        lower, upper = (max(int((way * (rows - columns)).max(initial=0)), 0) for way in (1, -1))
+        if BAND_COST * (lower + 1) * (lower + upper + 1) <= n * n:
+            return Banded(equation_of[order], order, lower, upper)
+    rows, columns = pattern.nonzero()
+    sparse = Sparse(rows, columns, pairing, _is_in(by_rate, rows, columns))
+    return sparse if SPARSE_COST * sparse.symbolic.cost <= n**3 / 3 else Dense(n)
 
 
-def _compression(pattern: Bool[np.ndarray, "n n"], storage: Storage) -> Compression:
-    n = len(pattern)
+def _compression(pattern: csr_array, storage: Storage) -> Compression:
     colours = column_colouring(pattern)
-    if isinstance(storage, Banded):
-        rows, columns = storage.positions()
-    else:
-        rows, columns = np.indices((n, n))
-    used = (columns >= 0) & pattern[rows, columns]
-    return Compression(seed_matrix(colours).T, np.where(used, colours[columns] * n + rows, -1))
+    rows, columns = storage.positions()
+    used = (columns >= 0) & _is_in(pattern, rows, columns)
+    return Compression(colours, np.where(used, colours[columns] * storage.size + rows, -1))
+
+
+def _is_in(pattern: csr_array, rows: Int[np.ndarray, "*stored"], columns: Int[np.ndarray, "*stored"]) -> Any:
+    """Which of the positions a pattern has."""
+    n, (i, j) = pattern.shape[1], pattern.nonzero()
+    return np.isin(rows.astype(np.int64) * n + columns, i.astype(np.int64) * n + j)

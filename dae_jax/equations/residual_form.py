@@ -20,6 +20,8 @@ from .mechanical import MechanicalODE
 
 # Up to this many unknowns multipliers are found without M⁻¹, where coordinates may be massless.
 BORDERED = 200
+# Above so many unknowns nothing is stored, or looked for, that grows with their square.
+LARGE = 256
 Form = Literal["index-3", "index-2", "GGL"]
 
 

@@ -33,7 +33,8 @@ from .derivative_orders import Combination, derivative_of, find_offsets
 from .initial_rates import is_nonlinear, rates_of
 from .manifold_ode import Feedback, ManifoldODE, at_one_instant
 from .mechanical import MechanicalODE
-from .residual_form import ResidualForm
+from .residual_form import LARGE, ResidualForm
+from .sparse_normals import SparseNormals
 from .taylor import total_derivatives
 
 
@@ -122,6 +123,7 @@ class StructuralODE(ManifoldODE):
     combination: Combination = eqx.field(static=True)
     orders: Orders = eqx.field(static=True)
     tearing: Tearing = eqx.field(static=True)
+    sparse: SparseNormals | None = eqx.field(static=True, default=None)
 
     @classmethod
     def of(cls, form: ResidualForm, dtype: DType, complete: bool = False) -> "StructuralODE":
@@ -137,7 +139,9 @@ class StructuralODE(ManifoldODE):
             return cls(form, found.combination, Orders(*(tuple(k + more for k in c) for c in offsets)), Tearing())
 
         if complete:
-            return differentiated(1)
+            ode = differentiated(1)
+            sparse = SparseNormals.of(ode, found.occurrence) if form.size > LARGE else None
+            return dataclasses.replace(ode, sparse=sparse)
         ode = differentiated(0)
         linear, known = ode._coefficients(dtype) if max(found.sigma.variable_offsets) else (False, np.zeros(0))
         if not linear:
@@ -232,6 +236,12 @@ class StructuralODE(ManifoldODE):
     def normals(self, t: Time, y: Float[Array, " N"]) -> Float[Array, "m N"]:
         """∂H/∂Y, whose rows are normal to the manifold in the metric in which all entries of Y count alike."""
         return jax.jacfwd(self.violations, 1)(t, y)
+
+    def sizes(self, t: Time, y: Float[Array, " N"]) -> Float[Array, " m"]:
+        """Σ |∂H/∂Y| of each invariant."""
+        if self.sparse is not None:
+            return self.sparse.row_sums(jnp.abs(self.sparse.entries(self, t, y)))
+        return jnp.sum(jnp.abs(self.normals(t, y)), 1)
 
     def tangent(self, dy: Float[Array, " N"], normals: Float[Array, "m N"]) -> Any:
         if not len(normals):
@@ -357,6 +367,8 @@ def _nearest(ode: StructuralODE, t: Time, known: Float[Array, " N"], weights: Fl
     def moved(y: Float[Array, " N"], start: Float[Array, " N"], params: PyTree) -> Any:
         """The point next to `start` on the linearisation of H = 0 at y."""
         ode, t, _, weights, *_ = params
+        if ode.sparse is not None:
+            return ode.sparse.nearest(ode, t, y, start, weights)
         a, h = ode.normals(t, y), ode.violations(t, y)
         largest = jnp.max(jnp.abs(a * weights), 1)
         scale = 1 / jnp.where(largest > 0, largest, 1)
@@ -386,7 +398,13 @@ def _nearest(ode: StructuralODE, t: Time, known: Float[Array, " N"], weights: Fl
 
     first, _ = settled((ode, t, known, weights), known, lambda y: jnp.where(is_value, known, y))
     params = (ode, t, known, weights, lax.stop_gradient(first))
-    return implicit_root(lambda y, p: y - moved(y, aim(y, p), p), iterate, params)[0]
+    return implicit_root(
+        lambda y, p: y - moved(y, aim(y, p), p), iterate, params, jacobian=_by_y if ode.sparse else None
+    )[0]
+
+
+def _by_y(*_: object) -> Any:
+    raise NotImplementedError(f"The derivative of a consistent state is for up to {LARGE} unknowns.")
 
 
 def _pivots(a: Float[Array, "m N"]) -> tuple[Float[Array, "m N"], Float[Array, ""]]:

@@ -31,6 +31,11 @@ class Dense:
         how = "inverses in plain arithmetic" if self.size <= LOOPED else "LU by LAPACK"
         return f"dense, {self.size} × {self.size}, {how}"
 
+    def positions(self) -> tuple[Int[np.ndarray, "n n"], Int[np.ndarray, "n n"]]:
+        """Row and column of each entry."""
+        rows, columns = np.indices((self.size, self.size))
+        return rows, columns
+
     def factor(self, a: Inexact[Array, "n n"]) -> tuple[Any, Float[Array, ""]]:
         """The factors, and the smallest pivot relative to the entries of its row: round-off where A is singular."""
         scale = _row_scale(a)
@@ -215,9 +220,6 @@ class Banded:
         interleave = lambda order: (s * order[:, None] + np.arange(s)).reshape(-1)
         band = Banded(interleave(self.rows), interleave(self.columns), s * self.lower + s - 1, s * self.upper + s - 1)
         return band, jnp.stack(rows, 1).reshape(s * n, -1)
-
-
-Storage = Dense | Banded
 
 
 def _cut(squares: Float[Array, " n"]) -> Float[Array, ""]:

@@ -47,5 +47,5 @@ def takes_residuals(solver: diffrax.AbstractSolver) -> TypeIs[AbstractResidualSo
 
 
 def counts(solver: diffrax.AbstractSolver) -> tuple[str, ...]:
-    """Which entries of the solver's state at the end of a solve are counts for `stats`."""
+    """Which entries of the solver's state at the end of a solve are counts for `stats`, by their paths."""
     return getattr(solver, "counts", ())

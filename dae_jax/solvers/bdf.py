@@ -18,6 +18,7 @@ from .residual_steps import (
     AbstractResidualSolver,
     Iteration,
     Tolerances,
+    Work,
     at_min_step,
     constant,
     corrected,
@@ -80,7 +81,7 @@ class _State(NamedTuple):
     the start or a jump; `order` of the next step; `used`: that of the last; `alike`: how many steps had this size and
     order; `rising`: the order has risen with every step so far; `wanted`: the size that the next step should have, more than
     it has where a step failed between; `held`: the size is not to be doubled yet; `factors` of ∂F/∂y + c ∂F/∂ẏ, and the c
-    they were made for; `eta`: θ/(1 − θ) of Newton's method.
+    they were made for; `eta`: θ/(1 − θ) of Newton's method; `work`: what has been done.
     """
 
     phi: Float[Array, "5 n"]
@@ -95,6 +96,7 @@ class _State(NamedTuple):
     factors: Any
     c: Float[Array, ""]
     eta: Float[Array, ""]
+    work: Work
 
 
 class _Factors(NamedTuple):
@@ -173,7 +175,7 @@ class BDF(Replayable, AbstractResidualSolver):
         like = _Step(args, sign, t1, t1 - t0, 1 / (t1 - t0), y0, y0)
         tol = tolerances(self.rtol, self.atol, y0.dtype)
         factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda: like.factor(y0, tol)[0]))
-        return _start(sign * args.start, factors)
+        return _start(sign * args.start, factors, Work.none())
 
     def invalidate_jacobian(self, state: _State) -> _State:
         return state._replace(c=jnp.zeros_like(state.c))
@@ -193,12 +195,14 @@ class BDF(Replayable, AbstractResidualSolver):
         sign, state = time_sign(terms, t0, t1), solver_state
         if made_jump is not False:
             state = lax.cond(
-                made_jump, lambda: _start(sign * constant(args.rates(sign * t0, y0)), state.factors), lambda: state
+                made_jump,
+                lambda: _start(sign * constant(args.rates(sign * t0, y0)), state.factors, state.work),
+                lambda: state,
             )
         tol = tolerances(self.rtol, self.atol, y0.dtype)
         k, method = state.order, _formula(state.order, state.steps == 0, state.psi, h)
         step, star = _predicted(method, k, state.phi, args, sign, t1, h, y0)
-        y1, (newton, passes, factors, pivot) = _point(
+        y1, (newton, passes, factors, pivot, work) = _point(
             lambda params: _solve(*params), (step, *constant((y0, state, is_smallest(t0, t1))), tol)
         )
         change, phi = _differences(y1 - step.y, star, k)
@@ -221,16 +225,16 @@ class BDF(Replayable, AbstractResidualSolver):
         new = _State(
             phi[1:], method.psi, state.steps + 1, decision.order, k, alike, decision.rising, decision.factor * h,
             held | (state.held & (decision.order > k)),
-            *constant((factors, method.c, newton.eta)),
+            *constant((factors, method.c, newton.eta, work)),
         )  # fmt: skip
-        new = jax.tree.map(lambda a, b: jnp.where(jumped, a, b), _start(jnp.zeros_like(y1), new.factors), new)
+        new = jax.tree.map(lambda a, b: jnp.where(jumped, a, b), _start(jnp.zeros_like(y1), new.factors, new.work), new)
         # Numbers, all of them: diffrax fills what is not reached with infinity.
         marks = (x.astype(y0.dtype) for x in (k, jumped, state.steps == 0))
         dense = {"phi": phi, "psi": method.psi, **dict(zip(("order", "jumped", "first"), marks, strict=True))}
         return y1, error, dense, new, result
 
     def history_at_start(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any) -> Any:
-        start = _start(time_sign(terms, t0, t1) * args.start, None)
+        start = _start(time_sign(terms, t0, t1) * args.start, None, Work.none())
         return start.phi, start.psi
 
     def history_after(self, dense: Any) -> Any:
@@ -283,7 +287,7 @@ def _differences(change: Any, star: list[Any], k: Any) -> tuple[Any, list[Any]]:
     return change, phi[:0:-1]
 
 
-def _start(rates: Float[Array, " n"], factors: Any) -> _State:
+def _start(rates: Float[Array, " n"], factors: Any, work: Work) -> _State:
     """No history: φ₁ is dy/dτ, to be multiplied by the size of the first step. It predicts only."""
     zero, count = jnp.zeros((), rates.dtype), jnp.zeros((), int)
     phi = jnp.stack([rates] + [jnp.zeros_like(rates)] * (MAX_ORDER - 1))
@@ -300,6 +304,7 @@ def _start(rates: Float[Array, " n"], factors: Any) -> _State:
         factors,
         zero,
         zero + 1,
+        work,
     )
 
 
@@ -348,7 +353,7 @@ def _solve(step: _Step, y0: Any, state: _State, smallest: Any, tol: Tolerances) 
     changed = jnp.abs(step.c - state.c) > ALIKE * step.c
 
     def attempt(carry: Any) -> Any:
-        tries, fresh, before, factors, _ = carry
+        tries, fresh, before, factors, _, work = carry
         renew = (tries > 0) | changed
         start = start_of(tries, step.y, before.x)
         new = lambda: step.factor(start, tol)
@@ -362,20 +367,20 @@ def _solve(step: _Step, y0: Any, state: _State, smallest: Any, tol: Tolerances) 
             lambda: corrected(iteration, start, tries, scale, differential, eta, tol),
             lambda: simplified_newton(iteration, start, weights / tol.scale(y0), eta, tol),
         )
-        return tries + 1, fresh | renew, newton, factors, pivot
+        return tries + 1, fresh | renew, newton, factors, pivot, work.and_of(renew, renew, newton.count)
 
     def again(carry: Any) -> Any:
         tries, fresh, newton, *_ = carry
         return goes_on(tries, newton.converged, fresh, smallest)
 
-    first = (0, jnp.asarray(False), not_begun(step.y, state.eta), state.factors, jnp.zeros_like(step.h))
-    _, fresh, newton, factors, pivot = lax.while_loop(again, attempt, first)
+    first = (0, jnp.asarray(False), not_begun(step.y, state.eta), state.factors, jnp.zeros_like(step.h), state.work)
+    _, fresh, newton, factors, pivot, work = lax.while_loop(again, attempt, first)
     # The rate with new factors says nothing of the next step, for which they are old.
     eta = jnp.where(fresh, 1, newton.eta)
     passes = passes_a_kink(newton, smallest, state.steps > 0)
     y = jnp.where(newton.converged | passes & differential, newton.x, jnp.where(passes, y0, step.y))
     found = newton._replace(x=None, eta=eta, converged=newton.converged | passes)
-    return y, (found, passes, factors, pivot)
+    return y, (found, passes, factors, pivot, work)
 
 
 class _Decision(NamedTuple):

@@ -19,6 +19,7 @@ from .residual_steps import (
     AbstractResidualSolver,
     Iteration,
     Tolerances,
+    Work,
     at_min_step,
     constant,
     corrected,
@@ -52,7 +53,7 @@ class _State(NamedTuple):
 
     `z`, `h`: stages and size of the last step, h = 0 before the first; `rates`: ẏ at its end; `jacobians`, `factors`
     (for the size `factored`); `refresh`: whether the Jacobians are to be evaluated anew; `eta`: θ/(1 − θ) of Newton's
-    method.
+    method; `work`: what has been done.
     """
 
     z: Float[Array, "s n"]
@@ -63,6 +64,7 @@ class _State(NamedTuple):
     factored: Float[Array, ""]
     refresh: Bool[Array, ""]
     eta: Float[Array, ""]
+    work: Work
 
 
 class AbstractRadauIIA(Replayable, AbstractResidualSolver):
@@ -102,6 +104,7 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
             zero,
             jnp.asarray(True),
             zero + 1,
+            Work.none(),
         )
 
     def invalidate_jacobian(self, state: _State) -> _State:
@@ -122,7 +125,9 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
         )
         step = Step(coefficients(self.stages), args, time_sign(terms, t0, t1), t0, t1, y0)
         tol = self._tolerances(y0.dtype)
-        z, (newton, jacobians, factors, pivot) = _stages(lambda params: _solve(*params), (step, constant(state), tol))
+        z, (newton, jacobians, factors, pivot, work) = _stages(
+            lambda params: _solve(*params), (step, constant(state), tol)
+        )
         y1 = y0 + z[-1]
         scaled = counted = _error(*constant((step, factors.real, z)), tol=tol) * args.weights(step.h)
         if args.between(self.dense).any():
@@ -138,7 +143,7 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
         slow = (newton.theta > FAST) & (newton.count > 1)
         # What jumped says nothing of the next step.
         size = jnp.where(smallest, 0, step.h)
-        new = _State(z, size, rates, jacobians, factors, size, slow, newton.eta)
+        new = _State(z, size, rates, jacobians, factors, size, slow, newton.eta, work)
         return y1, scaled, {"y0": y0, "z": z}, constant(new), result
 
     def replay(
@@ -258,15 +263,16 @@ def _solve(step: Step, state: _State, tol: Tolerances) -> Any:
     weights, differential = step.linearised.weights(h, tol.raised()), step.linearised.structure.differential
 
     def attempt(carry: Any) -> Any:
-        tries, fresh, before, jacobians, factors, _ = carry
+        tries, fresh, before, jacobians, factors, _, work = carry
         renew = (tries > 0) | state.refresh | smallest
         start = start_of(tries, jnp.where(tries == 0, predicted, 0), before.x)
         t, y = jnp.where(smallest, step.t1, step.t0), jnp.where(smallest, step.y0 + start[-1], step.y0)
         evaluate = lambda: step.jacobians(step.sign * t, y, state.rates)
         jacobians = lax.cond(renew, evaluate, lambda: jacobians)
         infinite = jnp.full_like(h, jnp.inf)
+        refactor = renew | (h != state.factored)
         factors, pivot = lax.cond(
-            renew | (h != state.factored),
+            refactor,
             lambda: step.factor(jacobians, tol),
             lambda: (factors, infinite),
         )
@@ -278,19 +284,20 @@ def _solve(step: Step, state: _State, tol: Tolerances) -> Any:
             lambda: corrected(iteration, start, tries, scale, differential, state.eta, tol),
             lambda: simplified_newton(iteration, start, weights / tol.scale(step.y0), state.eta, tol),
         )
-        return tries + 1, fresh | renew, newton, jacobians, factors, pivot
+        work = work.and_of(renew, refactor, newton.count)
+        return tries + 1, fresh | renew, newton, jacobians, factors, pivot, work
 
     def again(carry: Any) -> Any:
         tries, fresh, newton, *_ = carry
         return goes_on(tries, newton.converged, fresh, smallest)
 
     none = not_begun(predicted, state.eta)
-    first = (0, jnp.asarray(False), none, state.jacobians, state.factors, h)
-    _, _, newton, jacobians, factors, pivot = lax.while_loop(again, attempt, first)
+    first = (0, jnp.asarray(False), none, state.jacobians, state.factors, h, state.work)
+    _, _, newton, jacobians, factors, pivot, work = lax.while_loop(again, attempt, first)
     passes = passes_a_kink(newton, smallest, state.h != 0)
     z = jnp.where(passes & ~differential, 0, newton.x)
     found = newton._replace(x=None, converged=newton.converged | passes)
-    return z, (found, jacobians, factors, pivot)
+    return z, (found, jacobians, factors, pivot, work)
 
 
 def _error(step: Step, factor: Any, z: Any, tol: Tolerances) -> Float[Array, " n"]:

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..linalg import rms_norm, roundoff
 
@@ -35,6 +35,23 @@ HALVINGS = 40
 DAMPED, WHOLE = 40, 6
 
 
+class Work(NamedTuple):
+    """What the accepted steps have taken: Jacobians, factorisations, corrections of Newton's method."""
+
+    num_jacobians: Int[Array, ""]
+    num_factorisations: Int[Array, ""]
+    num_corrections: Int[Array, ""]
+
+    @classmethod
+    def none(cls) -> "Work":
+        """Before the first step."""
+        return cls(*[jnp.zeros((), int)] * 3)
+
+    def and_of(self, jacobian: Any, factorisation: Any, corrections: Any) -> "Work":
+        """With that of a try of a step."""
+        return Work(*(x + y for x, y in zip(self, (jacobian, factorisation, corrections), strict=True)))
+
+
 class AbstractResidualSolver(diffrax.AbstractAdaptiveSolver):
     """A solver of 0 = F(t, y, ẏ); needs a `LinearisedResidual` as `args`, one that is `starting`.
 
@@ -45,8 +62,8 @@ class AbstractResidualSolver(diffrax.AbstractAdaptiveSolver):
     # Up to which index the method converges, and takes the equations as they are written where nothing else is asked for.
     highest_index: AbstractClassVar[int]
     default_index: AbstractClassVar[int]
-    # Which entries of its state at the end of a solve are counts for `stats`.
-    counts: ClassVar[tuple[str, ...]] = ()
+    # Which entries of its state at the end of a solve are counts for `stats`, by their paths.
+    counts: ClassVar[tuple[str, ...]] = tuple(f"work.{name}" for name in Work._fields)
 
     rtol: Any = None
     atol: Any = None

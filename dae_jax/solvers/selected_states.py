@@ -77,7 +77,11 @@ class SelectedResiduals(Replayable, AbstractResidualSolver):
 
     highest_index = 1
     default_index = 1
-    counts: ClassVar[tuple[str, ...]] = ("switches",)
+
+    @property
+    def counts(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """That of selections, and those of the solver."""
+        return ("switches", *(f"inner.{path}" for path in self.solver.counts))
 
     @property
     def interpolation_cls(self) -> Any:

@@ -16,7 +16,9 @@ def column_colouring(pattern: Bool[np.ndarray, "m n"]) -> Int[np.ndarray, " n"]:
 
     Source: A. H. Gebremedhin, F. Manne, A. Pothen, What color is your Jacobian?, SIAM Review 47 (2005), sections 3, 7.
     """
-    neighbours = _column_intersection_graph(np.asarray(pattern, bool))
+    neighbours = _column_intersection_graph(
+        np.asarray(pattern.toarray() if hasattr(pattern, "toarray") else pattern, bool)
+    )
     orders = [list(range(len(neighbours))), _smallest_first(neighbours)[::-1]]
     return min((_greedy(neighbours, order) for order in orders), key=lambda colours: colours.max(initial=-1))
 

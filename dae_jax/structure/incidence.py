@@ -155,7 +155,7 @@ def signature(*patterns: np.ndarray) -> list[dict[int, int]]:
     """
     rows: list[dict[int, int]] = [{} for _ in range(patterns[0].shape[0])]
     for order, pattern in enumerate(patterns):
-        for equation, variable in np.argwhere(pattern):
+        for equation, variable in zip(*pattern.nonzero()):
             rows[int(equation)][int(variable)] = order
     return rows
 

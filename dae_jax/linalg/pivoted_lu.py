@@ -1,0 +1,89 @@
+"""LU of a sparse matrix with partial pivoting, by SuperLU on the host.
+
+Each call is a function of numbers alone; that the same matrix has been factorised before is remembered beside it.
+"""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Inexact, Int
+
+
+# How many matrices stay factorised: the iteration matrices of a step, and a few threads.
+KEPT = 8
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PivotedLU:
+    """For matrices with entries at (`rows`, `columns`). Compared by identity."""
+
+    rows: Int[np.ndarray, " entries"]
+    columns: Int[np.ndarray, " entries"]
+    size: int
+
+    def smallest(self, a: Inexact[Array, " entries"], needed: Bool[Array, ""]) -> Float[Array, ""]:
+        """The smallest pivot where the largest entry of each row is 1, 0 of a matrix that is singular or not finite; only where
+        it is `needed`.
+        """
+        real = jnp.finfo(a.dtype).dtype
+        on_host = lambda a, needed: np.asarray(_factors(self, *_key(a)).smallest if needed else 0.0, real)
+        return jax.pure_callback(on_host, jax.ShapeDtypeStruct((), real), a, needed, vmap_method="sequential")
+
+    def solve(
+        self, a: Inexact[Array, " entries"], b: Inexact[Array, " n"], needed: Bool[Array, ""], transposed: bool = False
+    ) -> Inexact[Array, " n"]:
+        """x with A x = b, or Aᵀ x = b; NaN where A is singular or not finite."""
+        dtype = jnp.result_type(a, b)
+
+        def on_host(a: Any, b: Any, needed: Any) -> np.ndarray:
+            return (
+                _factors(self, *_key(a)).solve(np.asarray(b, dtype), transposed) if needed else np.zeros(b.shape, dtype)
+            )
+
+        return jax.pure_callback(on_host, jax.ShapeDtypeStruct(b.shape, dtype), a, b, needed, vmap_method="sequential")
+
+
+@dataclasses.dataclass(frozen=True)
+class _Factors:
+    """What SuperLU made of the matrix whose rows were multiplied by `scale`; `None` of a singular one."""
+
+    lu: Any
+    scale: Float[np.ndarray, " n"]
+
+    @property
+    def smallest(self) -> float:
+        return 0.0 if self.lu is None else float(np.abs(self.lu.U.diagonal()).min())
+
+    def solve(self, b: np.ndarray, transposed: bool) -> np.ndarray:
+        if self.lu is None or not np.isfinite(b).all():
+            return np.full_like(b, np.nan)
+        found = self.lu.solve(b, "T") * self.scale if transposed else self.lu.solve(b * self.scale)
+        return found.astype(b.dtype)
+
+
+def _key(a: Any) -> tuple[bytes, str]:
+    a = np.asarray(a)
+    return a.tobytes(), a.dtype.str
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _factors(pattern: PivotedLU, entries: bytes, dtype: str) -> _Factors:
+    from scipy.sparse import csc_array
+    from scipy.sparse.linalg import splu
+
+    a, n = np.frombuffer(entries, dtype), pattern.size
+    largest = np.zeros(n, a.real.dtype)
+    np.maximum.at(largest, pattern.rows, np.abs(a))
+    if not (np.isfinite(largest).all() and largest.all()):
+        return _Factors(None, largest)
+    scale = 1 / largest
+    try:
+        lu = splu(csc_array((a * scale[pattern.rows], (pattern.rows, pattern.columns)), shape=(n, n)))
+    except RuntimeError:
+        # Exactly singular.
+        lu = None
+    return _Factors(lu, scale)

@@ -1,0 +1,89 @@
+"""The order in which a sparse matrix is eliminated, and which entries its factors have: found once, without numbers.
+
+Equations and unknowns are paired before, each pair is eliminated by its own pivot, and what is looked for is an order of the
+pairs with little fill.
+"""
+
+import dataclasses
+import functools
+
+import numpy as np
+from jaxtyping import Int
+
+
+# By how much diagonal entries exceed the others of their row together, where an elimination with numbers finds the pattern.
+DOMINANCE = 1e-3
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SymbolicLU:
+    """L U = P A Q of n unknowns by rows: L below the diagonal without its ones, U from there on. Compared by identity.
+
+    `rows`, `columns`: which of A stand where; `start`, `diagonal`, `at`: where each row begins and has its diagonal, and the
+    columns of its entries; `given_start`, `given`, `given_at`: the same of the entries of A, with their numbers.
+    """
+
+    rows: Int[np.ndarray, " n"]
+    columns: Int[np.ndarray, " n"]
+    start: Int[np.ndarray, " n+1"]
+    diagonal: Int[np.ndarray, " n"]
+    at: Int[np.ndarray, " filled"]
+    given_start: Int[np.ndarray, " n+1"]
+    given: Int[np.ndarray, " entries"]
+    given_at: Int[np.ndarray, " entries"]
+
+    @property
+    def size(self) -> int:
+        """The number of unknowns."""
+        return len(self.rows)
+
+    @functools.cached_property
+    def cost(self) -> int:
+        """Multiplications of a factorisation."""
+        after = self.start[1:] - self.diagonal - 1
+        row = np.repeat(np.arange(self.size), np.diff(self.start))
+        return int(after[self.at[self.at < row]].sum())
+
+
+def symbolic_lu(
+    rows: Int[np.ndarray, " entries"], columns: Int[np.ndarray, " entries"], pairing: Int[np.ndarray, " n"]
+) -> SymbolicLU:
+    """The order and the fill of the matrix with entries at (`rows`, `columns`), with pivots at (i, `pairing`[i]).
+
+    By minimum degree on the pattern of A + Aᵀ, of the paired matrix. SuperLU orders, and eliminates, an M-matrix of this pattern:
+    fill only adds negative numbers there, so that what is not 0 in its factors is the fill.
+
+    Source: J. W. H. Liu, Modification of the minimum-degree algorithm by multiple elimination, ACM Trans. Math. Softw. 11
+    (1985); X. S. Li, An overview of SuperLU, ACM Trans. Math. Softw. 31 (2005).
+    """
+    from scipy.sparse import csc_array, csr_array, diags_array
+    from scipy.sparse.linalg import splu
+
+    n = len(pairing)
+    paired = pairing[rows]
+    pattern = csr_array((np.ones(len(rows)), (paired, columns)), shape=(n, n))
+    both = csr_array(pattern + pattern.T)
+    both.setdiag(0)
+    both.eliminate_zeros()
+    both.data[:] = 1
+    m_matrix = csc_array(diags_array((1 + DOMINANCE) * (both.sum(1) + 1)) - both)
+    factors = splu(m_matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    filled = csr_array(factors.L != 0) + csr_array(factors.U != 0)
+    filled.sort_indices()
+    position = factors.perm_c
+    if not np.array_equal(position, factors.perm_r):
+        raise AssertionError("An elimination along the diagonal left it.")
+    variables = np.argsort(position)
+    at_row, at_column = position[paired], position[columns]
+    given = np.lexsort((at_column, at_row))
+    row_of_entry = np.repeat(np.arange(n), np.diff(filled.indptr))
+    return SymbolicLU(
+        np.argsort(pairing)[variables],
+        variables,
+        filled.indptr,
+        np.flatnonzero(row_of_entry == filled.indices),
+        filled.indices,
+        np.searchsorted(at_row[given], np.arange(n + 1)),
+        given,
+        at_column[given],
+    )
