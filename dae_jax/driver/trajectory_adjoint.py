@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from .program import Solve
 
 
-# Numbers on the tape, at most; beyond that diffrax's checkpoints.
-LARGEST_TAPE = 2**20
+# Numbers on the tape, at most; beyond that diffrax's checkpoints, which take twice the time and more.
+LARGEST_TAPE = 2**25
 
 
 def can_be_taped(solve: "Solve", size: int) -> bool:
@@ -41,7 +41,7 @@ def can_be_taped(solve: "Solve", size: int) -> bool:
         and solve.event is None
         and type(solve.controller) in (diffrax.PIDController, diffrax.ConstantStepSize)
         and solve.max_steps is not None
-        and (solve.max_steps + 1) * size <= LARGEST_TAPE
+        and (solve.max_steps + 1) * size * (1 + getattr(solve.solver, "kept", 0)) <= LARGEST_TAPE
         and (is_recomputable(solve.solver) or replays(solve.solver))
     )
 

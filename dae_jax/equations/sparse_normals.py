@@ -84,7 +84,7 @@ class SparseNormals:
         # What the free entries cannot mend stays as it is, in place of growing without bound.
         cut = 100 * jnp.finfo(y.dtype).eps
         entries = jnp.concatenate([jnp.ones_like(y), -s, s, jnp.full_like(h, cut)])
-        u = self._augmented.solve(entries, jnp.concatenate([jnp.zeros_like(y), b]), jnp.asarray(True))[: len(y)]
+        u = self._augmented.solve(entries, jnp.concatenate([jnp.zeros_like(y), b]))[: len(y)]
         return start - weights * u
 
     @functools.cached_property

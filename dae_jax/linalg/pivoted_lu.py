@@ -33,10 +33,21 @@ class PivotedLU:
         on_host = lambda a, needed: np.asarray(_factors(self, *_key(a)).smallest if needed else 0.0, real)
         return jax.pure_callback(on_host, jax.ShapeDtypeStruct((), real), a, needed, vmap_method="sequential")
 
-    def solve(
+    def solve(self, a: Inexact[Array, " entries"], b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
+        """x with A x = b, and its derivative; NaN where A is singular or not finite."""
+        apply = lambda x: jax.ops.segment_sum(a * x[self.columns], self.rows, self.size)
+        at_hand, needed = jax.lax.stop_gradient(a), jnp.asarray(True)
+        return jax.lax.custom_linear_solve(
+            apply,
+            b,
+            solve=lambda _, b: self.inverse(at_hand, b, needed),
+            transpose_solve=lambda _, b: self.inverse(at_hand, b, needed, transposed=True),
+        )
+
+    def inverse(
         self, a: Inexact[Array, " entries"], b: Inexact[Array, " n"], needed: Bool[Array, ""], transposed: bool = False
     ) -> Inexact[Array, " n"]:
-        """x with A x = b, or Aᵀ x = b; NaN where A is singular or not finite."""
+        """x with A x = b, or Aᵀ x = b, where that is `needed`; without a derivative."""
         dtype = jnp.result_type(a, b)
 
         def on_host(a: Any, b: Any, needed: Any) -> np.ndarray:
@@ -77,8 +88,10 @@ def _factors(pattern: PivotedLU, entries: bytes, dtype: str) -> _Factors:
 
     a, n = np.frombuffer(entries, dtype), pattern.size
     largest = np.zeros(n, a.real.dtype)
+    if not np.isfinite(a).all():
+        return _Factors(None, largest)
     np.maximum.at(largest, pattern.rows, np.abs(a))
-    if not (np.isfinite(largest).all() and largest.all()):
+    if not largest.all():
         return _Factors(None, largest)
     scale = 1 / largest
     try:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Inexact, Int, PyTree
 
 from ..compiler import compiles
 from .pivoted_lu import PivotedLU
-from .sparse_lu import Factors, Indices, eliminated, solved, solved_transposed
+from .sparse_lu import Indices, eliminated, solved, solved_transposed
 from .symbolic_lu import SymbolicLU, symbolic_lu
 
 
@@ -37,6 +37,9 @@ class Sparse:
     columns: Int[np.ndarray, " entries"]
     pairing: Int[np.ndarray, " n"]
     of_rates: Bool[np.ndarray, " entries"]
+
+    # To factorise takes as long as many solutions do.
+    dear: ClassVar[bool] = True
 
     @property
     def size(self) -> int:
@@ -79,7 +82,7 @@ class Sparse:
         at_hand = lax.stop_gradient(a)
 
         def inverse(transposed: bool, b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
-            pivoted = lambda: self._pivoted.solve(at_hand, b, poor, transposed)
+            pivoted = lambda: self._pivoted.inverse(at_hand, b, poor, transposed)
             if lu is None:
                 return pivoted()
             kernel = solved_transposed if transposed else solved
@@ -123,7 +126,7 @@ class Sparse:
         cut = 100 * jnp.finfo(a.dtype).eps * jnp.where(squares > 0, squares, 1)
         entries = jnp.concatenate([jnp.ones_like(b), a, a, jnp.full_like(b, -1) * cut])
         right = jnp.concatenate([b * scale, jnp.zeros_like(b)])
-        return self._augmented.solve(entries, right, jnp.asarray(True))[n:]
+        return self._augmented.solve(entries, right)[n:]
 
     @functools.cached_property
     def _augmented(self) -> PivotedLU:

@@ -7,7 +7,7 @@ derived by JAX in both modes. The unknowns of a band are reordered inside: vecto
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,6 +25,9 @@ class Dense:
     """
 
     size: int
+
+    # Whether to factorise takes as long as many solutions do.
+    dear: ClassVar[bool] = False
 
     def describe(self) -> str:
         """In words."""
@@ -96,6 +99,8 @@ class Banded:
     columns: Int[np.ndarray, " n"]
     lower: int
     upper: int
+
+    dear: ClassVar[bool] = False
 
     @property
     def size(self) -> int:

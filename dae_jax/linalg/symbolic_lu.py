@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Int
 
 
-# By how much diagonal entries exceed the others of their row together, where an elimination with numbers finds the pattern.
-DOMINANCE = 1e-3
+# By how much diagonal entries exceed the others of their row together, where an elimination with numbers finds the pattern: more,
+# and fill far from the diagonal would underflow.
+DOMINANCE = 1e-6
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -66,7 +67,7 @@ def symbolic_lu(
     both.setdiag(0)
     both.eliminate_zeros()
     both.data[:] = 1
-    m_matrix = csc_array(diags_array((1 + DOMINANCE) * (both.sum(1) + 1)) - both)
+    m_matrix = csc_array(diags_array((1 + DOMINANCE) * np.maximum(both.sum(1), 1)) - both)
     factors = splu(m_matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     filled = csr_array(factors.L != 0) + csr_array(factors.U != 0)
     filled.sort_indices()

@@ -164,6 +164,10 @@ class BDF(Replayable, AbstractResidualSolver):
     default_index = 1
     interpolation_cls = NewtonPolynomial
 
+    @property
+    def kept(self) -> int:
+        return len(ROWS)
+
     def order(self, terms: diffrax.AbstractTerm) -> int:
         return MAX_ORDER
 

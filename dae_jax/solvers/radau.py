@@ -46,6 +46,11 @@ FAST = 1e-2
 PATIENCE = 2.5
 # By which diffrax lets a step grow at most.
 GROWTH = 10
+# Step sizes that differ by less, relatively, are the same: their iteration matrices are.
+ALIKE = 1e-6
+# Where a factorisation takes as long as many steps, a step that could grow by no more than this keeps its size (the program
+# RADAU5); the part of the step-size controller in h_new = h · SAFETY · error^(−1 / order).
+WORTHWHILE, SAFETY = 1.2, 0.9
 
 
 class _State(NamedTuple):
@@ -77,6 +82,10 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
     interpolation_cls = CollocationPolynomial
 
     dense: bool = True
+
+    @property
+    def kept(self) -> int:
+        return self.stages + 1
 
     def order(self, terms: diffrax.AbstractTerm) -> int:
         return 2 * self.stages - 1
@@ -139,12 +148,21 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
         bend = constant((rates - state.rates) * (step.h / 2)) * args.structure.differential
         scaled = jnp.where(smallest, bend, counted)
         failure = of_step(newton.converged, pivot, y0.size, tol.norm(scaled, y0, y1))
+        scaled = scaled * self._held(args, tol.norm(scaled, y0, y1))
         y1, scaled, result = at_min_step(failure, t0, t1, y0, y1, scaled)
         slow = (newton.theta > FAST) & (newton.count > 1)
         # What jumped says nothing of the next step.
         size = jnp.where(smallest, 0, step.h)
         new = _State(z, size, rates, jacobians, factors, size, slow, newton.eta, work)
         return y1, scaled, {"y0": y0, "z": z}, constant(new), result
+
+    def _held(self, linearised: Any, error: Any) -> Any:
+        """By what to multiply an error from which a larger size would follow that is not worth new factors."""
+        if not linearised.storage.dear:
+            return 1.0
+        order = self.stages + 1
+        same = SAFETY**order
+        return jnp.where((error <= same) & (error >= same / WORTHWHILE**order), same / error, 1)
 
     def replay(
         self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any, history: Any, dense: Any
@@ -270,7 +288,7 @@ def _solve(step: Step, state: _State, tol: Tolerances) -> Any:
         evaluate = lambda: step.jacobians(step.sign * t, y, state.rates)
         jacobians = lax.cond(renew, evaluate, lambda: jacobians)
         infinite = jnp.full_like(h, jnp.inf)
-        refactor = renew | (h != state.factored)
+        refactor = renew | (jnp.abs(h - state.factored) > ALIKE * h)
         factors, pivot = lax.cond(
             refactor,
             lambda: step.factor(jacobians, tol),

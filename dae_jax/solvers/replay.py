@@ -13,6 +13,11 @@ class Replayable:
     A step is a function of its start y₀, its times, the problem, and a `history`: numbers that the step before it left.
     """
 
+    @property
+    def kept(self) -> int:
+        """How many vectors the dense output of a step holds."""
+        return 1
+
     def history_at_start(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any) -> Any:
         """The history before the first step."""
         return ()
