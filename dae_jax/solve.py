@@ -12,7 +12,7 @@ from jax.core import Tracer
 
 from .compiler.types import Arrays
 from .driver.doubts import warn
-from .driver.failures import OKAY, in_words, raised_in_the_program
+from .driver.failures import OKAY, in_words, raised_in_the_program, undetermined
 from .driver.options import refuse_misfits, refuse_no_event, refuse_other_steps, refuse_wrong_options
 from .driver.problem import Problem, Program, split
 from .driver.program import KEPT, Solve, run, traces
@@ -242,4 +242,5 @@ def _raise_if_failed(sol: DAESolution, problem: Problem) -> DAESolution:
         return raised_in_the_program(sol, problem)
     if int(sol.result._value) in OKAY:
         return sol
-    raise RuntimeError(" ".join([str(in_words(sol, problem)), not_finite(*problem.start)]).strip())
+    said = [str(in_words(sol, problem)), not_finite(*problem.start), undetermined(sol, problem)]
+    raise RuntimeError(" ".join(filter(None, said)))

@@ -14,6 +14,7 @@ from jaxtyping import Array, PyTree
 from .._compat import CALLBACK_LOG, messages, unvmap_any
 from ..consistent import Violation, violation
 from ..equations.mechanical import MechanicalODE
+from ..equations.singular_block import singular_block
 from ..solution import RESULTS, DAESolution
 from ..systems import is_mechanism
 from ..types import BoolScalar
@@ -38,6 +39,21 @@ def in_words(sol: DAESolution, problem: Problem | None = None) -> str | None:
     """
     off = problem and _off(eqx.combine(lax.stop_gradient(eqx.filter(problem, eqx.is_array)), problem))
     return _sentence(tuple(map(np.asarray, lax.stop_gradient(_details(sol)))), off)
+
+
+def undetermined(sol: DAESolution, problem: Problem) -> str:
+    """Which unknowns the equations do not determine where a solve ended with a singular iteration matrix, or at its start; empty
+    where that was not the failure, or nothing is found.
+    """
+    if sol.result != RESULTS.singular_iteration_matrix:
+        return ""
+    system, t0, y0, args = problem.start
+    points = [(t0, y0)]
+    if sol.ys is not None and jax.tree.structure(sol.ys) == jax.tree.structure(y0):
+        finite = [np.isfinite(x).reshape(len(x), -1).all(1) for x in (sol.ts, *jax.tree.leaves(sol.ys))]
+        reached = np.flatnonzero(np.all(finite, 0))[-1:]
+        points = [(sol.ts[k], jax.tree.map(lambda y, k=k: y[k], sol.ys)) for k in reached] + points
+    return next(filter(None, (singular_block(system, t, y, args) for t, y in points)), "")
 
 
 def _details(sol: DAESolution) -> tuple[Any, ...]:

@@ -57,6 +57,8 @@ class SelectedStates(Replayable, AbstractChartSolver):
             stays = jnp.all(before * after > 0)
             y1, error = or_nan(stays, y1), None if error is None else or_nan(stays, error)
             result = diffrax.RESULTS.where(stays, result, outcome(stays))
+            # Entries that are not integrated have no error, and none may be hidden among them.
+            error = None if error is None else error * (y1.size / (y1.size - len(directions))) ** 0.5
         return y1, error, dense, Selection(derivative, directions, solver_state.switches + switched), result
 
     def replay(

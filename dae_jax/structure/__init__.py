@@ -14,6 +14,7 @@ from .matching import (
     StructurallySingular as StructurallySingular,
     coarse_decomposition as coarse_decomposition,
     maximum_matching as maximum_matching,
+    require_nonsingular as require_nonsingular,
 )
 from .ordering import (
     BorderedOrder as BorderedOrder,

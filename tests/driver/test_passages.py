@@ -27,6 +27,7 @@ METHODS = {
     "GGL by Radau": (dae_jax.RadauIIA5(), dae_jax.GGL()),
     "differentiation": (diffrax.Tsit5(), dae_jax.Differentiation()),
     "Baumgarte": (diffrax.Tsit5(), dae_jax.Baumgarte(10.0, 10.0)),
+    "dummy derivatives": (dae_jax.DOP853(), dae_jax.DummyDerivatives()),
     "index 2 by Radau": (dae_jax.RadauIIA5(), dae_jax.Residual("index-2")),
 }
 
@@ -45,7 +46,7 @@ def passing(case, name, rtol, t1=0.6, **options):
 @pytest.mark.filterwarnings("ignore::dae_jax.AccuracyWarning")
 @pytest.mark.parametrize("name", METHODS)
 def test_near_a_dead_centre_an_answer_is_right_or_doubted(name):
-    for excess, rtol in itertools.product((1e-5, 1e-7, 1e-9, 1e-12), (1e-3, 1e-5, 1e-7)):
+    for excess, rtol in itertools.product((1e-5, 1e-7, 1e-9, 1e-12), (1e-3, 1e-4, 1e-5, 1e-7)):
         case = dead_centre(excess)
         truth, _ = case.truth([0.6])
         sol = passing(case, name, rtol)

@@ -103,7 +103,9 @@ def test_derivatives_by_matrix_and_right_hand_side():
     storage, a, rng = example(20)
     b, da, db, w = (jnp.asarray(rng.normal(size=x.size)) for x in (jnp.ones(20), a, jnp.ones(20), jnp.ones(20)))
     step = 1e-6
-    difference = (solve(storage, a + step * da, b + step * db) - solve(storage, a - step * da, b - step * db)) / (2 * step)
+    difference = (solve(storage, a + step * da, b + step * db) - solve(storage, a - step * da, b - step * db)) / (
+        2 * step
+    )
     of = lambda a, b: solve(storage, a, b)
     np.testing.assert_allclose(jax.jvp(of, (a, b), (da, db))[1], difference, rtol=1e-6, atol=1e-8)
     of_a, of_b = jax.vjp(of, a, b)[1](w)

@@ -308,3 +308,19 @@ def test_with_diffrax_itself(solver):
     assert sol.ys is not None
     end = jax.tree.map(lambda x: x[None], formulation.decode(scene.t1, sol.ys[-1], ode))
     assert scene.error(np.array([scene.t1]), end) < 1e-6
+
+
+def test_a_singular_iteration_matrix_names_equations_and_unknowns():
+    """From t = 1 on, two of the equations are one, and nothing tells u from v; x is determined, and w."""
+
+    def residual(t, y, yd, args):
+        x, u, v, w = y["x"], y["u"], y["v"], y["w"]
+        return [yd["x"] + x, u + v - x, 2 * (u + v - x) + jnp.maximum(1 - t, 0.0) * (u - v), w - x]
+
+    start = {name: jnp.asarray(value) for name, value in (("x", 1.0), ("u", 0.5), ("v", 0.5), ("w", 1.0))}
+    with pytest.raises(
+        RuntimeError, match=r"equations residual\[1\], residual\[2\] do not determine y\['u'\], y\['v'\]\."
+    ):
+        dae_jax.daesolve(
+            dae_jax.ImplicitDAE(residual), dae_jax.RadauIIA5(), 1.5, 2.0, None, start, saveat=diffrax.SaveAt(steps=True)
+        )
