@@ -87,8 +87,11 @@ class Unsolved(eqx.Module):
 
     def message(self) -> str:
         """Which equations are off, and by how much."""
-        off = np.flatnonzero(~(np.abs(np.asarray(self.residuals)) <= np.asarray(self.allowed)))
-        lines = [f"  0 = {self.equations[i]} is off by {float(self.residuals[i]):.6g}" for i in off[:LISTED]]
+        residuals, allowed = np.abs(np.asarray(self.residuals)), np.asarray(self.allowed)
+        off = np.flatnonzero(~(residuals <= allowed))
+        by_size = np.argsort(-residuals[off] / np.maximum(allowed[off], np.finfo(allowed.dtype).tiny), kind="stable")
+        worst = np.sort(off[by_size[:LISTED]])
+        lines = [f"  0 = {self.equations[i]} is off by {float(self.residuals[i]):.6g}" for i in worst]
         lines += [f"  and {len(off) - LISTED:,} more"] if len(off) > LISTED else []
         return "The initial state `y0` violates the equations, whatever its derivatives:\n" + "\n".join(lines)
 

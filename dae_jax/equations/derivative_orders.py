@@ -2,12 +2,14 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Inexact
 from scipy.sparse import csr_array
 
@@ -117,7 +119,39 @@ class Form(Protocol):
     def residual(self, t: Time, y: Flat, yd: Flat) -> Any: ...
 
 
+# What was found of the last systems, of which a solve asks several times.
+_found: dict[Hashable, Offsets] = {}
+KEPT = 16
+
+
 def find_offsets(form: Form, dtype: DType) -> Offsets:
+    """`offsets_of`, remembered."""
+    key = _known_by(form, dtype)
+    if key is None:
+        return offsets_of(form, dtype)
+    if key not in _found:
+        _found[key] = offsets_of(form, dtype)
+        for oldest in list(_found)[:-KEPT]:
+            _found.pop(oldest, None)
+    return _found[key]
+
+
+def _known_by(form: Form, dtype: DType) -> Hashable:
+    """What the offsets depend on; `None` where that are numbers, whose zeros count, or something that cannot be compared."""
+    arrays, rest = eqx.partition(form, eqx.is_array)
+    found = jax.tree.leaves(arrays)
+    if not all(isinstance(x, Tracer) for x in found):
+        return None
+    leaves, treedef = jax.tree.flatten(rest)
+    key = (*leaves, *map(type, leaves)), treedef, tuple((x.shape, x.dtype) for x in found), jnp.dtype(dtype)
+    try:
+        hash(key)
+    except TypeError:
+        return None
+    return key
+
+
+def offsets_of(form: Form, dtype: DType) -> Offsets:
     """The Σ-method, by the linear-combination method where it fails because terms cancel.
 
     Where u with constant entries makes uᵀ ∂F̄ᵢ/∂xⱼ^(dⱼ−cᵢ) = 0, one of the equations with the smallest offset c among those

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Inexact, Int, PyTree
 from scipy.sparse import csr_array
 
+from ..linalg import fixed_point, relative_change
 from ..linalg.dense import LOOPED
 from ..linalg.sparse import Sparse
 from ..linalg.storage import Banded, Dense
@@ -21,7 +22,7 @@ from ..structure import (
     sigma_method,
     signature,
 )
-from ..types import DType, Flat, IntScalar, Scalar, Time
+from ..types import DType, Flat, Scalar, Time
 from .derivative_orders import Combination, Offsets, find_offsets
 from .index1_form import Index1Form
 from .initial_rates import is_nonlinear, rates_of
@@ -32,6 +33,8 @@ from .residual_form import LARGE, ResidualForm
 Storage: TypeAlias = Dense | Banded | Sparse
 
 GAUSS_NEWTON = 5
+# Where each takes a factorisation, no more than are needed, and at most:
+DEAR_CORRECTIONS = 20
 # What a multiplication by a band, and one of sparse factors, costs, in parts of one of a dense matrix.
 BAND_COST, SPARSE_COST = 4, 16
 
@@ -180,10 +183,17 @@ class LinearisedResidual(eqx.Module):
         if is_nonlinear(self.form, y.dtype):
             return rates_of(self.form, t, y)[0]
 
-        def improve(_: IntScalar, yd: Flat) -> Any:
+        def improved(yd: Flat) -> Flat:
             return yd - self.storage.least_squares(self._by_rate(t, y, yd), self.residual(t, y, yd))
 
-        return jax.lax.fori_loop(0, GAUSS_NEWTON, improve, self.form.known_rates(y))
+        def correct(yd: Flat) -> tuple[Flat, Scalar]:
+            new = improved(yd)
+            return new, relative_change(new - yd, yd)
+
+        start = self.form.known_rates(y)
+        if self.storage.dear:
+            return fixed_point(correct, start, max_steps=DEAR_CORRECTIONS)[0]
+        return jax.lax.fori_loop(0, GAUSS_NEWTON, lambda _, yd: improved(yd), start)
 
     def starting(self, t: Time, y: Float[Array, " n"]) -> "LinearisedResidual":
         """For a solve from (t, y)."""
