@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Inexact, Int, PyTree
+from scipy.sparse import csr_array
 
 from ..linalg.dense import LOOPED
 from ..linalg.storage import Banded, Dense, Storage
@@ -86,10 +87,10 @@ class LinearisedResidual(eqx.Module):
             found = find_offsets(form, y.dtype)
         except NotImplementedError:
             # A primitive that structural analysis does not know: all may depend on all.
-            full = np.ones((y.size, y.size), bool)
+            full = csr_array(np.ones((y.size, y.size), bool))
             rows = signature(full, full)
             found = Offsets(full, full, rows, sigma_method(rows))
-        patterns = found.by_y.tobytes(), found.by_rate.tobytes()
+        patterns = found.by_y.toarray().tobytes(), found.by_rate.toarray().tobytes()
         indices = indices or found.indices
         offsets = found.sigma.variable_offsets
         return cls(form, _outline(*patterns, indices, offsets, found.index > 1, found.combination))
