@@ -9,10 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.sparse import csr_array
 
-from .equations.derivative_orders import Offsets, Slopes, find_offsets
+from .equations.derivative_orders import Offsets, find_offsets
 from .equations.residual_form import ResidualForm
+from .equations.slopes import Slopes
 from .equations.taylor import total_derivatives
+from .linalg.rank import is_nonsingular
 from .structure import Block, block_triangular, pantelides
 from .systems import System, is_mechanism
 from .tables import table
@@ -24,6 +27,8 @@ from .validate.user_functions import refuse_wrong_functions
 
 # A system of more variables is summed up in words; its incidence matrix would not fit a page.
 DRAWN = 60
+# The ranks of the derivative array of more equations would take minutes.
+RANKED = 500
 # A table in a notebook names so many hidden constraints at most.
 HIDDEN = 8
 
@@ -112,18 +117,22 @@ class Structure:
     def differential_index(self) -> int | None:
         """The smallest k for which F = 0, …, dᵏF/dtᵏ = 0 determine ẏ, found by the ranks of their Jacobian at the given
         state for generic derivatives; at most `index`. `None` where not `regular`: what is singular there on the solution need
-        not be so for generic derivatives. Takes a moment.
+        not be so for generic derivatives; and for systems of more than `RANKED` equations. Takes a moment.
 
         Source: S. L. Campbell, C. W. Gear, The index of general nonlinear DAEs, Numer. Math. 72 (1995).
         """
         n = len(self.equations)
-        for k in range(self.index + 1 if self.regular else 0):
-            slopes, values = _slopes_at(self.form, self.offsets, *self.point, k)
+        equations, variables = self.offsets.variables.nonzero()
+        for k in range(self.index + 1 if self.regular and n <= RANKED else 0):
+            slopes = Slopes(self.form.residual, self.offsets.variables, k, self.point[1].dtype)
+            values = _at_state(slopes, self.form, *self.point)
             array = np.zeros((k + 1, n, k + 1, n))
-            for level, i in np.ndindex(k + 1, n):
-                for (order, j), value in slopes.by_entry(values, level, i).items():
-                    if order:
-                        array[level, i, order - 1, j] = value
+            for level, order in np.ndindex(k + 1, k + 1):
+                at = (np.full_like(equations, x) for x in (level, order + 1))
+                level_of, order_of = at
+                array[level, equations, order, variables] = slopes.entries(
+                    values, level_of, equations, order_of, variables
+                )
             matrix = array.reshape((k + 1) * n, -1)
             for axis in (1, 0):
                 largest = np.abs(matrix).max(axis, keepdims=True)
@@ -207,6 +216,7 @@ def analyse(system: System, t0: Time, y0: State, args: Args = None) -> Structure
     point = jnp.asarray(t0, y.dtype), y
     found = find_offsets(form, y.dtype)
     sigma = found.sigma
+    blocks = tuple(block_triangular(found.pattern, sigma.transversal))
     return Structure(
         form,
         found,
@@ -217,8 +227,8 @@ def analyse(system: System, t0: Time, y0: State, args: Args = None) -> Structure
         sigma.variable_offsets,
         pantelides(found.signature).equation_offsets,
         sigma.transversal,
-        tuple(block_triangular(found.pattern, sigma.transversal)),
-        _regular(form, found, *point),
+        blocks,
+        _regular(form, found, blocks, *point),
     )
 
 
@@ -236,30 +246,31 @@ def _differentiated(times: int) -> str:
     )
 
 
-def _regular(form: ResidualForm, found: Offsets, t: Time, y: Flat) -> bool:
+def _regular(form: ResidualForm, found: Offsets, blocks: tuple[Block, ...], t: Time, y: Flat) -> bool:
     """Whether the system Jacobian has full rank at the state, for generic derivatives and multipliers."""
+    slopes = Slopes(form.residual, found.variables, found.combination.degree, y.dtype)
+    rows, columns, equations, times, orders, factors = (
+        np.array(part)
+        for part in zip(
+            *(
+                (i, j, k, often, found.signature[i][j], factor)
+                for i, variables in enumerate(found.pattern)
+                for k, often, factor in found.combination.terms(i)
+                for j in variables
+            ),
+            strict=True,
+        )
+    )
     for seed in range(3):
-        slopes, values = _slopes_at(form, found, t, y, found.combination.degree, seed)
-        matrix = np.zeros((len(y), len(y)))
-        for i, variables in enumerate(found.pattern):
-            for k, times, factor in found.combination.terms(i):
-                entries = slopes.by_entry(values, times, k)
-                for j in variables:
-                    matrix[i, j] += factor * entries.get((found.signature[i][j], j), 0)
-        rows = np.abs(matrix).max(1, keepdims=True)
-        if (rows > 0).all() and np.isfinite(matrix).all():
-            size = np.linalg.svd(matrix / rows, compute_uv=False)
-            if size[-1] > 100 * len(y) * jnp.finfo(y.dtype).eps * size[0]:
-                return True
+        values = factors * slopes.entries(_at_state(slopes, form, t, y, seed), times, equations, orders, columns)
+        matrix = csr_array((values, (rows, columns)), shape=(len(y), len(y)))
+        if is_nonsingular(matrix, blocks, float(jnp.finfo(y.dtype).eps)):
+            return True
     return False
 
 
-def _slopes_at(
-    form: ResidualForm, found: Offsets, t: Time, y: Flat, degree: int, seed: int = 0
-) -> tuple[Slopes, np.ndarray]:
-    """`Slopes` and what they give at a state, for generic derivatives and multipliers."""
+def _at_state(slopes: Slopes, form: ResidualForm, t: Time, y: Flat, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """What `slopes` give at a state, for generic derivatives and multipliers."""
     rng = np.random.default_rng(seed)
-    slopes = Slopes(form, found, degree, y.dtype)
     at = y.at[form.layout.size :].set(rng.normal(size=form.extra))
-    orders = jnp.stack([at, *jnp.asarray(rng.normal(size=slopes.shape), y.dtype)[1:]])
-    return slopes, np.asarray(jax.jit(slopes.along)(t, orders))
+    return slopes.at(t, jnp.stack([at, *jnp.asarray(rng.normal(size=slopes.shape), y.dtype)[1:]]))

@@ -10,26 +10,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Float, Inexact
+from jaxtyping import Array, Inexact
 from scipy.sparse import csr_array
 
-from ..compiler import Polynomial, polynomials
+from ..linalg.dense import LOOPED
 from ..structure import (
     SigmaAnalysis,
     StructurallySingular,
-    column_colouring,
-    dependence,
+    dependence_patterns,
+    in_short,
     jacobian_pattern,
-    seed_matrix,
     sigma_method,
     signature,
     variable_indices,
 )
-from ..types import DType, Flat, Scalar, Time
-from .taylor import total_derivatives
-
-
-_Polynomials = list[list[dict[tuple[int, int], Polynomial]]]
+from ..types import DType, Flat, Time
+from .slopes import Polynomials, Slopes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,17 +42,24 @@ class Combination:
         """How many derivatives of F are needed for F̄."""
         return max((k for _, terms in self.rows for _, k, _ in terms), default=0)
 
+    @functools.cached_property
+    def _replaced(self) -> dict[int, tuple[tuple[int, int, float], ...]]:
+        return dict(self.rows)
+
     def terms(self, equation: int) -> tuple[tuple[int, int, float], ...]:
         """What F̄ₗ is made of."""
-        return dict(self.rows).get(equation, ((equation, 0, 1.0),))
+        return self._replaced.get(equation, ((equation, 0, 1.0),))
 
     def of(self, levels: list[Inexact[Array, "n *k"]]) -> list[Inexact[Array, "n *k"]]:
         """F̄, dF̄/dt, … of F, dF/dt, …: as many fewer as the degree."""
         if not self.rows:
             return levels
         entry = lambda m, i: sum(a * levels[m + k][j] for j, k, a in self.terms(i))
-        count = len(levels) - self.degree
-        return [jnp.stack([entry(m, i) for i in range(len(levels[0]))]) for m in range(count)]
+        count, n = len(levels) - self.degree, len(levels[0])
+        if n <= LOOPED:
+            return [jnp.stack([entry(m, i) for i in range(n)]) for m in range(count)]
+        places = np.array(list(self._replaced))
+        return [levels[m].at[places].set(jnp.stack([entry(m, i) for i in places.tolist()])) for m in range(count)]
 
     def names(self, equations: tuple[str, ...]) -> tuple[str, ...]:
         """A name for each equation."""
@@ -68,10 +71,10 @@ class Combination:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Offsets:
-    """What the Σ-method finds of F̄. `by_y`, `by_rate`: the patterns of the Jacobians of F."""
+    """What the Σ-method finds of F̄. `by_y`, `by_rate`: the patterns of the Jacobians of F, with sorted indices."""
 
-    by_y: Bool[np.ndarray, "n n"]
-    by_rate: Bool[np.ndarray, "n n"]
+    by_y: csr_array
+    by_rate: csr_array
     signature: list[dict[int, int]]
     sigma: SigmaAnalysis
     combination: Combination = Combination()
@@ -84,6 +87,11 @@ class Offsets:
         return variable_indices(self.pattern, self.sigma.transversal, often, self.sigma.variable_offsets)
 
     @property
+    def variables(self) -> csr_array:
+        """Which variables occur in which equation of F, with a derivative or without."""
+        return self.by_y + self.by_rate
+
+    @property
     def index(self) -> int:
         """The structural index: how often equations must be differentiated for the derivatives of all variables."""
         return max(self.indices, default=0)
@@ -91,7 +99,7 @@ class Offsets:
     @functools.cached_property
     def occurrence(self) -> csr_array:
         """The variables of each equation F̄ᵢ, with any of their derivatives."""
-        of_f = csr_array(self.by_y) + csr_array(self.by_rate)
+        of_f = self.variables
         if not self.combination.rows:
             return of_f
         terms = [(i, j) for i in range(of_f.shape[0]) for j, *_ in self.combination.terms(i)]
@@ -157,7 +165,9 @@ def offsets_of(form: Form, dtype: DType) -> Offsets:
     Where u with constant entries makes uᵀ ∂F̄ᵢ/∂xⱼ^(dⱼ−cᵢ) = 0, one of the equations with the smallest offset c among those
     with uᵢ ≠ 0 is replaced by Σ uᵢ dᵏF̄ᵢ/dtᵏ, k = cᵢ − c, in which the cancelling terms are gone. Again until there is no such
     u: the degrees of freedom become fewer each time. What cancels is read from the equations, see
-    `dae_jax.compiler.jaxprs.polynomials`.
+    `dae_jax.compiler.jaxprs.polynomials`, which takes a time for each number: where that is too much, from about a thousand
+    equations that share their highest derivatives with others, it is not looked for, and offsets, index and degrees of freedom
+    are those of the pattern. `analyse` then finds the system Jacobian singular.
 
     Errors: `ValueError` for a structurally singular system, naming its equations and variables; `NotImplementedError` for a
     primitive that structural analysis does not know.
@@ -166,19 +176,19 @@ def offsets_of(form: Form, dtype: DType) -> Offsets:
     differential-algebraic equation systems, BIT 57 (2017).
     """
     y, time = jax.ShapeDtypeStruct((form.size,), dtype), jax.ShapeDtypeStruct((), dtype)
-    _, by_y, by_rate = dependence(form.residual, time, y, y, derivative=True)
+    _, by_y, by_rate = dependence_patterns(form.residual, time, y, y, derivative=True)
     rows = signature(by_y, by_rate)
     try:
         found = Offsets(by_y, by_rate, rows, sigma_method(rows))
     except StructurallySingular as singular:
         raise ValueError(_singular(form, singular)) from None
-    slopes = functools.cache(lambda degree: Slopes(form, found, degree, dtype).as_polynomials())
+    slopes = functools.cache(lambda degree: Slopes(form.residual, found.variables, degree, dtype).as_polynomials())
     while form.may_cancel and (better := _combined(slopes, found)):
         found = better
     return found
 
 
-def _combined(slopes: Callable[[int], _Polynomials | None], before: Offsets) -> Offsets | None:
+def _combined(slopes: Callable[[int], Polynomials | None], before: Offsets) -> Offsets | None:
     """With some of the equations replaced; `None` where nothing cancels."""
     c, d = before.sigma.equation_offsets, before.sigma.variable_offsets
     candidates = _may_cancel(before.pattern)
@@ -218,37 +228,7 @@ def _combined(slopes: Callable[[int], _Polynomials | None], before: Offsets) -> 
     return after if after.sigma.degrees_of_freedom < before.sigma.degrees_of_freedom else None
 
 
-class Slopes:
-    """∂F/∂y^(k), of dF/dt and so on up to a `degree`, along as few directions as tell them apart."""
-
-    def __init__(self, form: Form, found: Offsets, degree: int, dtype: DType) -> None:
-        # A derivative of an equation has no variables but those of the equation.
-        self.pattern = found.by_y | found.by_rate
-        self.colours = column_colouring(self.pattern)
-        self.form, self.degree, self.dtype = form, degree, dtype
-        self.shape = (degree + 2, form.size)
-
-    def along(self, t: Scalar, orders: Float[Array, "orders n"]) -> Float[Array, "directions levels n"]:
-        """The directional derivatives at t and (y, ẏ, …)."""
-        levels = lambda orders: jnp.stack(total_derivatives(self.form.residual, t, list(orders), self.degree + 1))
-        directions = np.kron(np.eye(self.shape[0]), seed_matrix(self.colours).T).reshape(-1, *self.shape)
-        return jax.vmap(lambda v: jax.jvp(levels, (orders,), (v,))[1])(jnp.asarray(directions, self.dtype))
-
-    def by_entry(self, found: np.ndarray, k: int, i: int) -> dict[tuple[int, int], Any]:
-        """Of the k-th derivative of equation i, by order and variable, from what `along` gives."""
-        found = found.reshape(self.shape[0], -1, *found.shape[1:])
-        places = np.flatnonzero(self.pattern[i])
-        return {(m, int(j)): found[m, self.colours[j], k, i] for m in range(self.shape[0]) for j in places}
-
-    def as_polynomials(self) -> _Polynomials | None:
-        """For each derivative and each equation, by order and variable; `None` where they have no such form."""
-        found = polynomials(self.along, *(jax.ShapeDtypeStruct(shape, self.dtype) for shape in ((), self.shape)))
-        if found is None:
-            return None
-        return [[self.by_entry(found, k, i) for i in range(self.form.size)] for k in range(self.degree + 1)]
-
-
-def _summed(terms: Sequence[tuple[int, int, float]], slopes: _Polynomials) -> dict[tuple[int, int, Any], float]:
+def _summed(terms: Sequence[tuple[int, int, float]], slopes: Polynomials) -> dict[tuple[int, int, Any], float]:
     """The slopes of a combination: coefficients that are not 0, by order, variable and monomial."""
     value: dict[tuple[int, int, Any], float] = {}
     size: dict[tuple[int, int, Any], float] = {}
@@ -264,16 +244,21 @@ def _summed(terms: Sequence[tuple[int, int, float]], slopes: _Polynomials) -> di
 
 def _may_cancel(pattern: list[list[int]]) -> list[int]:
     """The equations that are not alone in any of their columns, those left out that are."""
+    occurs_in: dict[int, list[int]] = {}
+    for i, variables in enumerate(pattern):
+        for j in variables:
+            occurs_in.setdefault(j, []).append(i)
+    count = {j: len(equations) for j, equations in occurs_in.items()}
     left = set(range(len(pattern)))
-    while True:
-        count: dict[int, int] = {}
-        for i in left:
-            for j in pattern[i]:
-                count[j] = count.get(j, 0) + 1
-        alone = {i for i in left if any(count[j] == 1 for j in pattern[i])}
-        if not alone:
-            return sorted(left)
-        left -= alone
+    alone = [j for j, number in count.items() if number == 1]
+    for j in alone:
+        for i in left.intersection(occurs_in[j]):
+            left.remove(i)
+            for other in pattern[i]:
+                count[other] -= 1
+                if count[other] == 1:
+                    alone.append(other)
+    return sorted(left)
 
 
 def _left_null_vectors(rows: Sequence[Mapping[tuple[int, Any], float]]) -> list[dict[int, float]]:
@@ -316,9 +301,9 @@ def _sign(factor: float, place: int) -> str:
 def _singular(form: Form, singular: StructurallySingular) -> str:
     parts = []
     if singular.equations:
-        names = ", ".join(form.equations[i] for i in singular.equations)
+        names = in_short([form.equations[i] for i in singular.equations])
         parts.append(f"the equations {names} have too few variables between them")
     if singular.variables:
-        names = ", ".join(form.variables[j] for j in singular.variables)
+        names = in_short([form.variables[j] for j in singular.variables])
         parts.append(f"the variables {names} have too few equations between them")
     return f"The system is structurally singular: {'; '.join(parts)}."

@@ -104,7 +104,7 @@ class LinearisedResidual(eqx.Module):
             found = find_offsets(form, y.dtype)
         except NotImplementedError:
             # A primitive that structural analysis does not know: all may depend on all.
-            full = np.ones((y.size, y.size), bool)
+            full = csr_array(np.ones((y.size, y.size), bool))
             rows = signature(full, full)
             found = Offsets(full, full, rows, sigma_method(rows))
         indices = indices or found.indices

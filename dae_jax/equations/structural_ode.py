@@ -164,7 +164,7 @@ class StructuralODE(ManifoldODE):
 
         found = interpreted(coefficients, time, state, y)
         n = self.form.size
-        linear = not (found.on[2][: n * n].any() or found.jumps[2].any())
+        linear = not (found.on[2][: n * n].nnz or found.jumps[2].nnz)
         return linear, found.numbers[: n * n].reshape(n, n)
 
     # The equations and their derivatives

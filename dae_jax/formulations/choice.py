@@ -3,12 +3,11 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.sparse import csr_array
 from scipy.sparse.csgraph import structural_rank
 
 from ..equations.derivative_orders import find_offsets
 from ..equations.residual_form import Form, ResidualForm
-from ..structure import dependence
+from ..structure import dependence, in_short
 from ..systems import System
 from ..types import Args, State, Time
 
@@ -33,9 +32,8 @@ def why_not_as_written(system: System, t: Time, state: State, args: Args, form: 
         return ""
     if found.index > highest:
         beyond = [name for name, k in zip(residual.variables, found.indices, strict=True) if k > highest]
-        return f"the index of {', '.join(beyond)} is {found.index}, and it converges for an index up to {highest}"
-    occurs = found.by_rate.any(0)
-    if found.index < 2 or structural_rank(csr_array(found.by_rate)) == occurs.sum():
+        return f"the index of {in_short(beyond)} is {found.index}, and it converges for an index up to {highest}"
+    if found.index < 2 or structural_rank(found.by_rate) == len(np.unique(found.by_rate.indices)):
         return ""
     y, time = jax.ShapeDtypeStruct((residual.size,), dtype), jax.ShapeDtypeStruct((), dtype)
     on = dependence(jax.jacfwd(residual.residual, 2), time, y, y, derivative=True)

@@ -5,14 +5,15 @@ from .colouring import column_colouring as column_colouring, seed_matrix as seed
 from .incidence import (
     Interpretation as Interpretation,
     dependence as dependence,
+    dependence_patterns as dependence_patterns,
     interpreted as interpreted,
     is_linear as is_linear,
-    signature as signature,
 )
 from .matching import (
     CoarseDecomposition as CoarseDecomposition,
     StructurallySingular as StructurallySingular,
     coarse_decomposition as coarse_decomposition,
+    in_short as in_short,
     maximum_matching as maximum_matching,
     require_nonsingular as require_nonsingular,
 )
@@ -23,6 +24,7 @@ from .ordering import (
     reverse_cuthill_mckee as reverse_cuthill_mckee,
 )
 from .pantelides import Pantelides as Pantelides, pantelides as pantelides
+from .patterns import Pattern as Pattern, signature as signature, variables_of as variables_of
 from .sigma import (
     SigmaAnalysis as SigmaAnalysis,
     highest_value_transversal as highest_value_transversal,

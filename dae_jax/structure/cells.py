@@ -8,6 +8,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from ..compiler.types import Aval, Equation
+from .sets import Ids, Sets
 
 
 class Cells:
@@ -15,7 +16,7 @@ class Cells:
 
     **Attributes**, all of the array's shape:
 
-    - `dependence`: the inputs that the entry depends on, as a set of bits in a Python integer (dtype object).
+    - `dependence`: the inputs that the entry depends on, as the id of a set in the `Sets` of the interpretation.
     - `known`: whether the entry is the same number whatever the inputs are; it then depends on nothing.
     - `value`: that number; without meaning where not known.
 
@@ -24,8 +25,8 @@ class Cells:
 
     __slots__ = ("dependence", "known", "value")
 
-    def __init__(self, dependence: np.ndarray | int, known: np.ndarray | bool, value: ArrayLike) -> None:
-        self.dependence = as_sets(dependence)
+    def __init__(self, dependence: Ids | int, known: np.ndarray | bool, value: ArrayLike) -> None:
+        self.dependence = np.asarray(dependence, np.int64)
         self.known = np.asarray(known, bool)
         self.value = np.asarray(value)
 
@@ -33,13 +34,13 @@ class Cells:
     def constant(cls, value: ArrayLike) -> "Cells":
         """Known numbers."""
         value = np.asarray(value)
-        return cls(np.broadcast_to(_NOTHING, value.shape), np.broadcast_to(_TRUE, value.shape), value)
+        return cls(np.zeros(value.shape, np.int64), np.ones(value.shape, bool), value)
 
     @classmethod
-    def unknown(cls, dependence: np.ndarray | int, aval: Aval) -> "Cells":
+    def unknown(cls, dependence: Ids | int, aval: Aval) -> "Cells":
         """Entries with the given dependence, broadcast to the shape of `aval`."""
-        dependence = np.broadcast_to(as_sets(dependence), aval.shape)
-        return cls(dependence, np.broadcast_to(_FALSE, aval.shape), np.broadcast_to(placeholder(aval), aval.shape))
+        dependence = broadcast(np.asarray(dependence, np.int64), aval.shape)
+        return cls(dependence, np.zeros(aval.shape, bool), np.zeros(aval.shape, placeholder(aval).dtype))
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -54,19 +55,19 @@ class Cells:
         """Entries moved about: `move` applied to all three arrays."""
         return Cells(move(self.dependence), move(self.known), move(self.value))
 
-    def also(self, dependence: np.ndarray | int) -> "Cells":
+    def also(self, dependence: Ids, sets: Sets) -> "Cells":
         """The same entries, those not known with a further dependence (which broadcasts)."""
-        return Cells(unless(self.known, self.dependence | dependence), self.known, self.value)
+        return Cells(unless(self.known, sets.union(self.dependence, dependence)), self.known, self.value)
 
-    def join(self, other: "Cells") -> "Cells":
+    def join(self, other: "Cells", sets: Sets) -> "Cells":
         """What is one or the other: known only where both are known and equal."""
         known = self.known & other.known & (self.value == other.value)
-        return Cells(unless(known, self.dependence | other.dependence), known, self.value)
+        return Cells(unless(known, sets.union(self.dependence, other.dependence)), known, self.value)
 
-    def within(self, other: "Cells") -> bool:
+    def within(self, other: "Cells", sets: Sets) -> bool:
         """Whether `join` would add nothing to `other`."""
-        joined = other.join(self)
-        return np.array_equal(joined.known, other.known) and np.array_equal(joined.dependence, other.dependence)
+        joined = other.join(self, sets)
+        return np.array_equal(joined.known, other.known) and sets.equal(joined.dependence, other.dependence)
 
 
 def placeholder(aval: Aval) -> np.ndarray:
@@ -86,29 +87,14 @@ def evaluate(eqn: Equation, values: Sequence[np.ndarray]) -> list[Any]:
     return list(out) if eqn.primitive.multiple_results else [out]
 
 
-def unless(mask: np.ndarray | bool, dependence: np.ndarray | int) -> np.ndarray:
+def broadcast(a: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """`np.broadcast_to`, which takes its time also where there is nothing to do."""
+    return a if a.shape == shape else np.broadcast_to(a, shape)
+
+
+def unless(mask: np.ndarray | bool, dependence: Ids | int) -> Ids:
     """The dependence, and nothing where `mask`."""
-    return np.where(mask, _NOTHING, as_sets(dependence))
+    return np.where(mask, _NOTHING, dependence)
 
 
-def union(dependence: np.ndarray, axes: tuple[int, ...], keepdims: bool = False) -> np.ndarray:
-    """The union of the dependences along `axes`."""
-    return as_sets(np.bitwise_or.reduce(dependence, axis=axes, initial=0, keepdims=keepdims))
-
-
-def as_sets(dependence: np.ndarray | int) -> np.ndarray:
-    """An array of Python integers. numpy's own would overflow, and it makes one of a scalar wherever it can."""
-    if isinstance(dependence, np.ndarray) and dependence.dtype != object:
-        raise AssertionError(f"Dependences must be Python integers, not {dependence.dtype}.")
-    return np.asarray(dependence, object)
-
-
-def as_rows(sets: Sequence[int], n: int) -> np.ndarray:
-    """Sets of bits as the rows of a boolean matrix with n columns."""
-    n_bytes = (n + 7) // 8
-    packed = np.frombuffer(b"".join(bits.to_bytes(n_bytes, "little") for bits in sets), np.uint8)
-    return np.unpackbits(packed.reshape(len(sets), n_bytes), axis=1, count=n, bitorder="little").astype(bool)
-
-
-_NOTHING = np.zeros((), object)
-_FALSE, _TRUE = np.zeros((), bool), np.ones((), bool)
+_NOTHING = np.zeros((), np.int64)

@@ -3,22 +3,26 @@
 import heapq
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
+from scipy.sparse import csr_array
+
+from .patterns import Pattern, variables_of
 
 
-def column_colouring(pattern: Bool[np.ndarray, "m n"]) -> Int[np.ndarray, " n"]:
+def column_colouring(pattern: Pattern) -> Int[np.ndarray, " n"]:
     """A colour 0, 1, ... for each column, such that columns of one colour have no nonzero row in common.
 
     Greedy, in the order given and in smallest-last order, whichever needs fewer; a chain gets as many colours as its
-    fullest row has nonzeros, the least there can be. With the 0-1 matrix S of `seed_matrix`, the compressed Jacobian
+    fullest row has nonzeros, the least there can be; so does a pattern with a full row. With the 0-1 matrix S of `seed_matrix`, the compressed Jacobian
     J S (one directional derivative a colour) holds every nonzero: J[i, j] = (J S)[i, colours[j]]. An empty column has
     colour 0.
 
     Source: A. H. Gebremedhin, F. Manne, A. Pothen, What color is your Jacobian?, SIAM Review 47 (2005), sections 3, 7.
     """
-    neighbours = _column_intersection_graph(
-        np.asarray(pattern.toarray() if hasattr(pattern, "toarray") else pattern, bool)
-    )
+    pattern = csr_array(pattern)
+    if np.diff(pattern.indptr).max(initial=0) == pattern.shape[1]:
+        return np.arange(pattern.shape[1])
+    neighbours = _column_intersection_graph(pattern)
     orders = [list(range(len(neighbours))), _smallest_first(neighbours)[::-1]]
     return min((_greedy(neighbours, order) for order in orders), key=lambda colours: colours.max(initial=-1))
 
@@ -28,13 +32,10 @@ def seed_matrix(colours: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n colours"
     return (colours[:, None] == np.arange(colours.max(initial=-1) + 1)).astype(float)
 
 
-def _column_intersection_graph(pattern: np.ndarray) -> list[set[int]]:
+def _column_intersection_graph(pattern: csr_array) -> list[set[int]]:
     """For each column the others with which it shares a nonzero row."""
-    columns_of = [np.flatnonzero(row).tolist() for row in pattern]
-    return [
-        {other for row in np.flatnonzero(column) for other in columns_of[row]} - {j}
-        for j, column in enumerate(pattern.T)
-    ]
+    columns_of, rows_of = variables_of(pattern), variables_of(pattern.T.tocsr())
+    return [{other for row in rows for other in columns_of[row]} - {j} for j, rows in enumerate(rows_of)]
 
 
 def _greedy(neighbours: list[set[int]], order: list[int]) -> np.ndarray:

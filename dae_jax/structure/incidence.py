@@ -10,6 +10,8 @@ surely as too few make it fail.
 """
 
 import functools
+import itertools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -19,7 +21,8 @@ import numpy as np
 from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Literal
 from jax.typing import ArrayLike
-from jaxtyping import Bool, Float, PyTree
+from jaxtyping import Float, PyTree
+from scipy.sparse import csr_array
 
 from ..compiler import ALL_CALLS, called
 from ..compiler.types import Aval, Equation, aval_of
@@ -29,43 +32,45 @@ from . import (
     incidence_entries as entries,
     incidence_indexing as indexing,
 )
-from .cells import Cells, as_rows, evaluate, has_extended_dtype
+from .cells import Cells, evaluate, has_extended_dtype
+from .sets import Sets
 
 
-Rule = Callable[[Any, list[Cells]], list[Cells]]
-
-RULES: Mapping[str, Rule] = {
-    **dict.fromkeys(entries.ELEMENTWISE, entries.elementwise),
+# Primitives that move entries about.
+MOVES: Mapping[str, Callable[[Any, list[Cells]], list[Cells]]] = {
     **dict.fromkeys(entries.MOVEMENT, entries.movement),
     **dict.fromkeys(entries.IDENTITY, lambda eqn, inputs: inputs),
+    "concatenate": entries.concatenate,
+    "iota": entries.iota,
+    "pad": entries.pad,
+    "platform_index": lambda eqn, inputs: [Cells.unknown(0, eqn.outvars[0].aval)],
+    "split": entries.split,
+    "stack": entries.stack,
+    "unstack": entries.unstack,
+}
+
+# Primitives whose rule unites what the operands depend on.
+RULES: Mapping[str, Callable[[Any, list[Cells], Sets], list[Cells]]] = {
+    **dict.fromkeys(entries.ELEMENTWISE, entries.elementwise),
     **dict.fromkeys(contractions.REDUCTIONS, contractions.reduction),
     **dict.fromkeys(contractions.CUMULATIVE, contractions.cumulative),
     **dict.fromkeys([*contractions.DENSE, "fft"], contractions.dense),
     **dict.fromkeys(contractions.RANDOM, contractions.mixed),
     **dict.fromkeys(indexing.SCATTERS, indexing.scatter),
-    "concatenate": entries.concatenate,
     "conv_general_dilated": contractions.convolution,
     "dot_general": contractions.dot_general,
     "dynamic_slice": indexing.dynamic_slice,
     "dynamic_update_slice": indexing.dynamic_update_slice,
     "gather": indexing.gather,
-    "iota": entries.iota,
-    "pad": entries.pad,
-    "platform_index": lambda eqn, inputs: [Cells.unknown(0, eqn.outvars[0].aval)],
     "reduce": contractions.general_reduction,
     "select_n": entries.select_n,
-    "split": entries.split,
-    "stack": entries.stack,
+    "sort": contractions.sort,
     "top_k": contractions.top_k,
     "triangular_solve": contractions.triangular_solve,
-    "unstack": entries.unstack,
 }
 
-# What becomes of the sets of inputs on which an entry depends with a derivative that is zero wherever it exists.
-Flat = Callable[[np.ndarray], np.ndarray]
-
 # Primitives whose rule runs inner jaxprs.
-CONTROL: Mapping[str, Callable[[Any, list[Cells], control.Run], list[Cells]]] = {
+CONTROL: Mapping[str, Callable[[Any, list[Cells], control.Run, Sets], list[Cells]]] = {
     "cond": control.cond,
     "custom_linear_solve": control.linear_solve,
     "scan": control.scan,
@@ -76,9 +81,7 @@ CONTROL: Mapping[str, Callable[[Any, list[Cells], control.Run], list[Cells]]] = 
 CALLS = {**ALL_CALLS, "call": "call_jaxpr", "composite": "jaxpr", "core_call": "call_jaxpr"}
 
 # Cheap on numbers by their own rule; everything else is evaluated as a whole where all its operands are known.
-_CHEAP = frozenset({*entries.ELEMENTWISE, *entries.MOVEMENT, *entries.IDENTITY, *CALLS}) | {
-    "concatenate", "iota", "pad", "platform_index", "select_n", "split", "stack", "unstack",
-}  # fmt: skip
+_CHEAP = frozenset({*entries.ELEMENTWISE, *MOVES, *CALLS, "select_n"})
 
 
 def dependence(fn: Callable[..., Any], *example_args: PyTree, derivative: bool = False) -> list[np.ndarray]:
@@ -97,16 +100,21 @@ def dependence(fn: Callable[..., Any], *example_args: PyTree, derivative: bool =
 
     Raises `NotImplementedError` for a primitive without a rule, with its name.
     """
+    return [pattern.toarray() for pattern in dependence_patterns(fn, *example_args, derivative=derivative)]
+
+
+def dependence_patterns(fn: Callable[..., Any], *example_args: PyTree, derivative: bool = False) -> list[csr_array]:
+    """What `dependence` gives, as sparse matrices with sorted indices."""
     return interpreted(fn, *example_args, derivative=derivative).on
 
 
 class Interpretation(NamedTuple):
-    """What `dependence` gives, the part of it in which outputs `jump` (through comparisons, rounding, `sign`, integers, truth
-    values and `stop_gradient`), and the outputs that are `numbers` whatever the arguments are, NaN where they are none.
+    """What `dependence_patterns` gives, the part of it in which outputs `jump` (through comparisons, rounding, `sign`, integers,
+    truth values and `stop_gradient`), and the outputs that are `numbers` whatever the arguments are, NaN where they are none.
     """
 
-    on: list[Bool[np.ndarray, "outputs inputs"]]
-    jumps: list[Bool[np.ndarray, "outputs inputs"]]
+    on: list[csr_array]
+    jumps: list[csr_array]
     numbers: Float[np.ndarray, " outputs"]
 
 
@@ -117,20 +125,19 @@ def interpreted(fn: Callable[..., Any], *example_args: PyTree, derivative: bool 
     leaves, treedef = jax.tree.flatten(example_args)
     avals = [_aval(leaf) for leaf in leaves]
     closed = jax.make_jaxpr(lambda *flat: fn(*jax.tree.unflatten(treedef, flat)))(*avals)
-    sizes = [int(np.prod(aval.shape)) for aval in avals]
-    inputs, start = [], 0
+    sizes = [math.prod(aval.shape) for aval in avals]
+    sets = Sets(sum(sizes), slopes_only=derivative)
+    inputs, start = [], 1
     for aval, size in zip(avals, sizes, strict=True):
-        bits = np.array([1 << bit for bit in range(start, start + size)], object).reshape(aval.shape)
         discrete = derivative and not jnp.issubdtype(aval.dtype, jnp.inexact)
-        inputs.append(Cells.unknown(0 if discrete else bits, aval))
+        ids = np.arange(start, start + size).reshape(aval.shape)
+        inputs.append(Cells.unknown(0 if discrete else ids, aval))
         start += size
-    # What a set holds above the inputs are those through which it jumps.
-    inside = (1 << start) - 1
-    flat = (lambda sets: sets & 0) if derivative else (lambda sets: sets | (sets & inside) << start)
-    outputs = _run(closed, inputs, flat)
-    pattern = as_rows([bits for cells in outputs for bits in cells.dependence.reshape(-1)], 2 * start)
-    ends = np.cumsum([sum(jax.tree.leaves(part)) for part in jax.tree.unflatten(treedef, sizes)])
-    on, jumps = (np.split(half, ends.astype(int)[:-1], axis=1) for half in (pattern[:, :start], pattern[:, start:]))
+    outputs = _run(closed, inputs, sets)
+    found = sets.rows(np.concatenate([np.zeros(0, np.int64), *(cells.dependence.reshape(-1) for cells in outputs)]))
+    ends = np.cumsum([1, *(sum(jax.tree.leaves(part)) for part in jax.tree.unflatten(treedef, sizes))])
+    parts = list(itertools.pairwise(ends.astype(int).tolist()))
+    on, jumps = ([pattern[:, low:high] for low, high in parts] for pattern in found)
     numbers = [np.where(cells.known, cells.value, np.nan).reshape(-1) for cells in outputs]
     return Interpretation(on, jumps, np.concatenate([np.zeros(0), *numbers]))
 
@@ -146,21 +153,10 @@ def is_linear(fn: Callable[..., Any], *example_args: Any, argument: int) -> bool
 
     found = interpreted(slope, example_args[argument], *example_args)
     values = found.on[0].shape[0] // 2
-    return not (found.jumps[1 + argument].any() or found.on[1 + argument][values:].any())
+    return not (found.jumps[1 + argument].nnz or found.on[1 + argument][values:].nnz)
 
 
-def signature(*patterns: np.ndarray) -> list[dict[int, int]]:
-    """For each equation its variables with their highest derivative, from the patterns of shape (equations, variables)
-    with respect to the variables themselves, their first derivatives, their second derivatives, and so on.
-    """
-    rows: list[dict[int, int]] = [{} for _ in range(patterns[0].shape[0])]
-    for order, pattern in enumerate(patterns):
-        for equation, variable in zip(*pattern.nonzero()):
-            rows[int(equation)][int(variable)] = order
-    return rows
-
-
-def _run(closed: ClosedJaxpr, inputs: Sequence[Cells], flat: Flat) -> list[Cells]:
+def _run(closed: ClosedJaxpr, inputs: Sequence[Cells], sets: Sets) -> list[Cells]:
     """The outputs of a jaxpr on `inputs`."""
     jaxpr = closed.jaxpr
     env: dict[Any, Cells] = dict(zip(jaxpr.invars, inputs, strict=True))
@@ -168,27 +164,27 @@ def _run(closed: ClosedJaxpr, inputs: Sequence[Cells], flat: Flat) -> list[Cells
         env[variable] = _constant(const, aval_of(variable))
     for eqn in jaxpr.eqns:
         if eqn.outvars:
-            outputs = _run_eqn(eqn, [_read(env, atom) for atom in eqn.invars], flat)
+            outputs = _run_eqn(eqn, [_read(env, atom) for atom in eqn.invars], sets)
             env.update(zip(eqn.outvars, outputs, strict=True))
     return [_read(env, atom) for atom in jaxpr.outvars]
 
 
-def _run_eqn(eqn: Equation, inputs: list[Cells], flat: Flat) -> list[Cells]:
+def _run_eqn(eqn: Equation, inputs: list[Cells], sets: Sets) -> list[Cells]:
     """The outputs of one equation of a jaxpr: numbers where the operands are, else by its rule."""
     name = eqn.primitive.name
     if name not in _CHEAP and not eqn.effects and all(cells.known.all() for cells in inputs):
         numbers = evaluate(eqn, [cells.value for cells in inputs])
         return [_constant(number, out.aval) for number, out in zip(numbers, eqn.outvars, strict=True)]
-    run = functools.partial(_run, flat=flat)
+    run = functools.partial(_run, sets=sets)
     inner = called(eqn, CALLS)
     if inner is not None:
         outputs = run(inner, inputs)
     elif name in CONTROL:
-        outputs = CONTROL[name](eqn, inputs, run)
-    elif name == "sort":
-        outputs = contractions.sort(eqn, inputs, flat)
+        outputs = CONTROL[name](eqn, inputs, run, sets)
+    elif name in MOVES:
+        outputs = MOVES[name](eqn, inputs)
     elif name in RULES:
-        outputs = RULES[name](eqn, inputs)
+        outputs = RULES[name](eqn, inputs, sets)
     else:
         raise NotImplementedError(
             f"How the outputs of the primitive `{name}` depend on its inputs is not known. "
@@ -197,13 +193,13 @@ def _run_eqn(eqn: Equation, inputs: list[Cells], flat: Flat) -> list[Cells]:
     for cells, out in zip(outputs, eqn.outvars, strict=True):
         if cells.shape != out.aval.shape:
             raise AssertionError(f"The rule of `{name}` gave shape {cells.shape}, not {out.aval.shape}.")
-    return [_flattened(cells, out.aval, name, flat) for cells, out in zip(outputs, eqn.outvars, strict=True)]
+    return [_flattened(cells, out.aval, name, sets) for cells, out in zip(outputs, eqn.outvars, strict=True)]
 
 
-def _flattened(cells: Cells, aval: Aval, name: str, flat: Flat) -> Cells:
-    """With the dependences whose derivative is zero as `flat` has them."""
+def _flattened(cells: Cells, aval: Aval, name: str, sets: Sets) -> Cells:
+    """With what has a derivative that is zero wherever it exists as reached through a jump."""
     if name in entries.FLAT or not jnp.issubdtype(aval.dtype, jnp.inexact):
-        return Cells(flat(cells.dependence), cells.known, cells.value)
+        return Cells(sets.through_jump(cells.dependence), cells.known, cells.value)
     return cells
 
 

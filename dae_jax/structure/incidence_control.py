@@ -7,18 +7,20 @@ from jax.extend.core import ClosedJaxpr
 
 from ..compiler.types import Equation
 from .blocks import block_triangular
-from .cells import Cells, as_rows, union
+from .cells import Cells
 from .incidence_entries import together
 from .matching import maximum_matching
+from .sets import Ids, Sets
 
 
 # Loops of more steps than this are summarised by a fixed point.
 LONGEST_LOOP = 10_000
 
+# Runs another jaxpr on cells, with the same sets.
 Run = Callable[[ClosedJaxpr, Sequence[Cells]], list[Cells]]
 
 
-def cond(eqn: Equation, inputs: list[Cells], run: Run) -> list[Cells]:
+def cond(eqn: Equation, inputs: list[Cells], run: Run, sets: Sets) -> list[Cells]:
     """The branch, if it is known; else any branch, and what the choice depends on."""
     choice, *operands = inputs
     branches = eqn.params["branches"]
@@ -26,17 +28,17 @@ def cond(eqn: Equation, inputs: list[Cells], run: Run) -> list[Cells]:
         return run(branches[min(max(int(choice.value), 0), len(branches) - 1)], operands)
     either, *others = (run(branch, operands) for branch in branches)
     for other in others:
-        either = [a.join(b) for a, b in zip(either, other, strict=True)]
-    return [cells.also(choice.dependence) for cells in either]
+        either = [a.join(b, sets) for a, b in zip(either, other, strict=True)]
+    return [cells.also(choice.dependence, sets) for cells in either]
 
 
-def scan(eqn: Equation, inputs: list[Cells], run: Run) -> list[Cells]:
+def scan(eqn: Equation, inputs: list[Cells], run: Run, sets: Sets) -> list[Cells]:
     """Step by step; a loop of more than `LONGEST_LOOP` steps as one step repeated any number of times."""
     p = eqn.params
     n_consts, n_carry, length = p["num_consts"], p["num_carry"], p["length"]
     consts, carry, xs = inputs[:n_consts], inputs[n_consts : n_consts + n_carry], inputs[n_consts + n_carry :]
     if length > LONGEST_LOOP:
-        return _long_scan(eqn, consts, carry, xs, run)
+        return _long_scan(eqn, consts, carry, xs, run, sets)
     rows: list[list[Cells]] = []
     for step in reversed(range(length)) if p["reverse"] else range(length):
         now = [x.map(lambda a, step=step: a[step, ...]) for x in xs]
@@ -49,18 +51,20 @@ def scan(eqn: Equation, inputs: list[Cells], run: Run) -> list[Cells]:
     return [*carry, *(together(np.stack, list(y)) for y in ys)]
 
 
-def _long_scan(eqn: Equation, consts: list[Cells], carry: list[Cells], xs: list[Cells], run: Run) -> list[Cells]:
+def _long_scan(
+    eqn: Equation, consts: list[Cells], carry: list[Cells], xs: list[Cells], run: Run, sets: Sets
+) -> list[Cells]:
     """A scan in which every step may see any entry of `xs`, after any number of steps."""
     body, n_carry = eqn.params["jaxpr"], len(carry)
     avals = [variable.aval for variable in body.jaxpr.invars[len(consts) + n_carry :]]
-    any_x = [Cells.unknown(union(x.dependence, (0,)), aval) for x, aval in zip(xs, avals, strict=True)]
-    carry = _repeat(lambda state: run(body, [*consts, *state, *any_x])[:n_carry], carry)
+    any_x = [Cells.unknown(sets.over(x.dependence, (0,)), aval) for x, aval in zip(xs, avals, strict=True)]
+    carry = _repeat(lambda state: run(body, [*consts, *state, *any_x])[:n_carry], carry, sets)
     ys = run(body, [*consts, *carry, *any_x])[n_carry:]
     outs = eqn.outvars[n_carry:]
     return [*carry, *(Cells.unknown(y.dependence, out.aval) for y, out in zip(ys, outs, strict=True))]
 
 
-def while_loop(eqn: Equation, inputs: list[Cells], run: Run) -> list[Cells]:
+def while_loop(eqn: Equation, inputs: list[Cells], run: Run, sets: Sets) -> list[Cells]:
     """Step by step while the condition is known; from then on any number of steps, and what decides it."""
     p = eqn.params
     n_cond, n_body = p["cond_nconsts"], p["body_nconsts"]
@@ -78,71 +82,68 @@ def while_loop(eqn: Equation, inputs: list[Cells], run: Run) -> list[Cells]:
     def step(state: list[Cells]) -> list[Cells]:
         decided_by = run(p["cond_jaxpr"], [*cond_consts, *state])[0].dependence
         after = run(p["body_jaxpr"], [*body_consts, *state])
-        return [cells if same else cells.also(decided_by) for cells, same in zip(after, kept, strict=True)]
+        return [cells if same else cells.also(decided_by, sets) for cells, same in zip(after, kept, strict=True)]
 
-    return _repeat(step, state)
+    return _repeat(step, state, sets)
 
 
-def _repeat(step: Callable[[list[Cells]], list[Cells]], state: list[Cells]) -> list[Cells]:
+def _repeat(step: Callable[[list[Cells]], list[Cells]], state: list[Cells], sets: Sets) -> list[Cells]:
     """What `state` may be after any number of steps."""
     while True:
         after = step(state)
-        if all(new.within(old) for new, old in zip(after, state, strict=True)):
+        if all(new.within(old, sets) for new, old in zip(after, state, strict=True)):
             return state
-        state = [old.join(new) for old, new in zip(state, after, strict=True)]
+        state = [old.join(new, sets) for old, new in zip(state, after, strict=True)]
 
 
-def linear_solve(eqn: Equation, inputs: list[Cells], run: Run) -> list[Cells]:
+def linear_solve(eqn: Equation, inputs: list[Cells], run: Run, sets: Sets) -> list[Cells]:
     """A x = b, given by the function x ↦ A x: the pattern of A⁻¹ by blocks, whatever algorithm solves it.
 
-    Row i of A x is run with a bit of its own for each unknown, which gives the unknowns in equation i beside what its
-    coefficients depend on. In block triangular order a block's unknowns depend on all that its equations depend on and
-    on the unknowns found before.
+    A x is run for unknowns that depend on nothing, which gives what the coefficients of an equation depend on, and for unknowns
+    that are new elements, which gives the unknowns in it. In block triangular order a block's unknowns depend on all that its
+    equations depend on and on the unknowns found before.
     """
     lengths = eqn.params["const_lengths"]
     right, avals = inputs[sum(lengths) :], [out.aval for out in eqn.outvars]
-    first = max(int(bits).bit_length() for cells in inputs for bits in [*cells.dependence.reshape(-1), 0])
     ends = np.cumsum([0, *(cells.dependence.size for cells in right)]).tolist()
     n = ends[-1]
 
-    def shaped(entries: np.ndarray) -> list[Cells]:
+    def shaped(entries: Ids) -> list[Cells]:
         return [
             Cells.unknown(entries[low:high].reshape(aval.shape), aval)
             for low, high, aval in zip(ends[:-1], ends[1:], avals, strict=True)
         ]
 
-    unknowns = shaped(np.array([1 << bit for bit in range(first, first + n)], object))
-    left = _flat(run(eqn.params["jaxprs"].matvec, [*inputs[: lengths.matvec], *unknowns]))
-    rows = [np.flatnonzero(row).tolist() for row in as_rows([bits >> first for bits in left], n)]
-    own = [(a & ((1 << first) - 1)) | b for a, b in zip(left, _flat(right), strict=True)]
-    nonzero = [bool(entry) for part in right for entry in part.nonzero.reshape(-1)]
-    return shaped(np.array(_solve_blocks(rows, own, nonzero), object))
+    def times(unknowns: Ids) -> Ids:
+        return _flat(run(eqn.params["jaxprs"].matvec, [*inputs[: lengths.matvec], *shaped(unknowns)]))
+
+    own = sets.union(times(np.zeros(n, np.int64)), _flat(right))
+    unknowns = sets.elements(n)
+    on, jumps = sets.rows(times(unknowns))
+    pattern = (on + jumps)[:, unknowns]
+    rows = [part.tolist() for part in np.split(pattern.indices, pattern.indptr[1:-1])]
+    nonzero = np.concatenate([part.nonzero.reshape(-1) for part in right])
+    return shaped(_solve_blocks(rows, own, nonzero, sets))
 
 
-def _solve_blocks(rows: list[list[int]], own: list[int], nonzero: list[bool]) -> list[int]:
+def _solve_blocks(rows: list[list[int]], own: Ids, nonzero: np.ndarray, sets: Sets) -> Ids:
     """What each unknown depends on, of equations with the given unknowns, own dependences and right-hand sides.
 
     A block without a right-hand side, its own or from the blocks before, is solved by 0.
     """
     matching = [variable for variable in maximum_matching(rows, len(rows)) if variable is not None]
-    everything = 0
-    for bits in own:
-        everything |= bits
-    found = [everything] * len(rows)
     if len(matching) < len(rows):
-        return found
-    moves = [False] * len(rows)
+        return np.broadcast_to(sets.over(own, (0,)), own.shape)
+    found, moves = np.zeros_like(own), np.zeros(len(rows), bool)
     for block in block_triangular(rows, matching):
-        before = {variable for equation in block.equations for variable in rows[equation]} - {*block.variables}
-        before = {variable for variable in before if moves[variable]}
-        moving = bool(before) or any(nonzero[equation] for equation in block.equations)
-        total = 0
-        for bits in [*(own[equation] for equation in block.equations), *(found[variable] for variable in before)]:
-            total |= bits if moving else 0
-        for variable in block.variables:
-            found[variable], moves[variable] = total, moving
+        equations, variables = list(block.equations), list(block.variables)
+        before = {variable for equation in equations for variable in rows[equation]} - {*variables}
+        before = [variable for variable in sorted(before) if moves[variable]]
+        if before or nonzero[equations].any():
+            found[variables] = sets.over(np.concatenate([own[equations], found[before]]), (0,))
+            moves[variables] = True
     return found
 
 
-def _flat(cells: list[Cells]) -> list[int]:
-    return [bits for part in cells for bits in part.dependence.reshape(-1)]
+def _flat(cells: list[Cells]) -> Ids:
+    return np.concatenate([part.dependence.reshape(-1) for part in cells])

@@ -7,7 +7,8 @@ import numpy as np
 
 from ..compiler import on_numbers
 from ..compiler.types import Equation
-from .cells import Cells, evaluate, unless
+from .cells import Cells, broadcast, evaluate, unless
+from .sets import Sets
 
 
 _ELEMENTWISE = """
@@ -24,16 +25,16 @@ ELEMENTWISE = frozenset(_ELEMENTWISE.split())
 FLAT = frozenset(["ceil", "floor", "round", "sign", "stop_gradient"])
 
 
-def elementwise(eqn: Equation, inputs: list[Cells]) -> list[Cells]:
+def elementwise(eqn: Equation, inputs: list[Cells], sets: Sets) -> list[Cells]:
     """Each entry depends on what the entries at its place depend on, unless these settle it.
 
     A product with a known 0 is 0, also where the other factor may be infinite.
     """
     aval = eqn.outvars[0].aval
-    settled = np.broadcast_to(_settled(eqn, inputs), aval.shape)
+    settled = broadcast(np.asarray(_settled(eqn, inputs)), aval.shape)
     known, dependence = inputs[0].known, inputs[0].dependence
     for cells in inputs[1:]:
-        known, dependence = known & cells.known, dependence | cells.dependence
+        known, dependence = known & cells.known, sets.union(dependence, cells.dependence)
     known = known | settled
     if not known.any():
         return [Cells.unknown(dependence, aval)]
@@ -61,7 +62,7 @@ def _settled(eqn: Equation, inputs: list[Cells]) -> Any:
 def _values(eqn: Equation, inputs: list[Cells], settled: np.ndarray) -> np.ndarray:
     """The numbers of the known entries; the others are arbitrary."""
     name, aval = eqn.primitive.name, eqn.outvars[0].aval
-    values = [np.broadcast_to(cells.value, aval.shape) for cells in inputs]
+    values = [broadcast(cells.value, aval.shape) for cells in inputs]
     with np.errstate(all="ignore"):
         if name == "convert_element_type":
             result = values[0].astype(aval.dtype)
@@ -70,21 +71,21 @@ def _values(eqn: Equation, inputs: list[Cells], settled: np.ndarray) -> np.ndarr
         else:
             result = on_numbers(eqn, values)
             result = np.asarray(evaluate(eqn, values)[0]) if result is None else result
-    result = np.broadcast_to(result, aval.shape)
+    result = broadcast(result, aval.shape)
     if not settled.any():
         return result
     return np.where(settled, np.asarray({"mul": 0, "and": 0, "div": 0}.get(name, 1), aval.dtype), result)
 
 
-def select_n(eqn: Equation, inputs: list[Cells]) -> list[Cells]:
+def select_n(eqn: Equation, inputs: list[Cells], sets: Sets) -> list[Cells]:
     """Where the predicate is known the chosen case alone; elsewhere any case and the predicate."""
     predicate, *cases = inputs
     shape = eqn.outvars[0].aval.shape
     which = np.broadcast_to(predicate.value, shape).astype(int)
     either = cases[0]
     for case in cases[1:]:
-        either = either.join(case)
-    either = either.also(predicate.dependence)
+        either = either.join(case, sets)
+    either = either.also(predicate.dependence, sets)
     chosen_known = np.broadcast_to(predicate.known, shape)
     if not chosen_known.any():
         return [either]

@@ -5,8 +5,13 @@ nonsingular when all are paired; otherwise the Dulmage–Mendelsohn decompositio
 and which too many variables.
 """
 
-from collections.abc import Collection, Iterable, Sequence
+import itertools
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import NamedTuple
+
+
+# A sentence names so many equations or variables.
+NAMED = 8
 
 
 class StructurallySingular(ValueError):
@@ -23,10 +28,16 @@ class StructurallySingular(ValueError):
         self.variables = tuple(sorted(variables))
         parts = []
         if self.equations:
-            parts.append(f"the equations {list(self.equations)} have too few variables between them")
+            parts.append(f"the equations [{in_short(self.equations)}] have too few variables between them")
         if self.variables:
-            parts.append(f"the variables {list(self.variables)} have too few equations between them")
+            parts.append(f"the variables [{in_short(self.variables)}] have too few equations between them")
         super().__init__(f"The system is structurally singular: {'; '.join(parts)}.")
+
+
+def in_short(names: Collection[object]) -> str:
+    """The first few of them, and how many more there are."""
+    first = ", ".join(map(str, itertools.islice(names, NAMED)))
+    return f"{first} and {len(names) - NAMED} more" if len(names) > NAMED else first
 
 
 class CoarseDecomposition(NamedTuple):
@@ -44,34 +55,84 @@ class CoarseDecomposition(NamedTuple):
     regular_variables: tuple[int, ...]
 
 
-def maximum_matching(incidence: Sequence[Collection[int]], n_variables: int) -> list[int | None]:
+def maximum_matching(
+    incidence: Sequence[Collection[int]], n_variables: int, start: Sequence[int | None] = ()
+) -> list[int | None]:
     """The variable that each equation is paired with in a matching of greatest size; `None` if unpaired.
 
-    `incidence[i]` holds the variables of equation i. One shortest augmenting path an equation, O(equations · entries).
+    `incidence[i]` holds the variables of equation i; `start` is a matching to begin with, whose equations stay paired. In
+    phases, each of which finds as many disjoint shortest augmenting paths as there are room for: O(entries · √equations).
 
-    Source: C. Berge, Two theorems in graph theory, Proc. Nat. Acad. Sci. 43 (1957).
+    Source: J. E. Hopcroft, R. M. Karp, An n^(5/2) algorithm for maximum matchings in bipartite graphs, SIAM J. Comput. 2
+    (1973).
     """
+    variable_of: list[int | None] = list(start) or [None] * len(incidence)
     equation_of: list[int | None] = [None] * n_variables
-    variable_of: list[int | None] = [None] * len(incidence)
-    for start in range(len(incidence)):
-        reached_from: dict[int, int] = {}  # variable -> the equation that it was reached from
-        queue, free = [start], None
-        for equation in queue:
-            for variable in incidence[equation]:
-                if variable in reached_from:
-                    continue
-                reached_from[variable] = equation
-                owner = equation_of[variable]
-                if owner is None:
-                    free = variable
-                    break
-                queue.append(owner)
+    for equation, variable in enumerate(variable_of):
+        if variable is not None:
+            equation_of[variable] = equation
+    for equation, variable in enumerate(variable_of):
+        if variable is None:
+            free = next((j for j in incidence[equation] if equation_of[j] is None), None)
             if free is not None:
-                break
-        while free is not None:
-            equation = reached_from[free]
-            equation_of[free], variable_of[equation], free = equation, free, variable_of[equation]
+                equation_of[free], variable_of[equation] = equation, free
+    while depth := _layers(incidence, equation_of, variable_of):
+        _augment(incidence, equation_of, variable_of, depth)
     return variable_of
+
+
+def _layers(
+    incidence: Sequence[Collection[int]], equation_of: list[int | None], variable_of: list[int | None]
+) -> dict[int, int]:
+    """How far from an unpaired equation alternating paths reach the others, as far as the nearest unpaired variable; empty where
+    none is reached.
+    """
+    queue = [equation for equation, variable in enumerate(variable_of) if variable is None]
+    depth = dict.fromkeys(queue, 0)
+    last = len(incidence)
+    for equation in queue:
+        if depth[equation] > last:
+            break
+        for variable in incidence[equation]:
+            owner = equation_of[variable]
+            if owner is None:
+                last = depth[equation]
+            elif owner not in depth:
+                depth[owner] = depth[equation] + 1
+                queue.append(owner)
+    return depth if last < len(incidence) else {}
+
+
+def _augment(
+    incidence: Sequence[Collection[int]],
+    equation_of: list[int | None],
+    variable_of: list[int | None],
+    depth: dict[int, int],
+) -> None:
+    """Pairs along disjoint paths from layer to layer."""
+    rest: dict[int, Iterator[int]] = {}
+    for root in [equation for equation, layer in depth.items() if layer == 0]:
+        path, through = [root], list[int]()
+        while path:
+            equation = path[-1]
+            for variable in rest.setdefault(equation, iter(incidence[equation])):
+                owner = equation_of[variable]
+                if owner is None or depth.get(owner) == depth[equation] + 1:
+                    through.append(variable)
+                    break
+            else:
+                # A dead end: back by one.
+                depth.pop(path.pop())
+                if through:
+                    through.pop()
+                continue
+            if owner is not None:
+                path.append(owner)
+                continue
+            for equation, variable in zip(path, through, strict=True):
+                equation_of[variable], variable_of[equation] = equation, variable
+                depth.pop(equation)
+            break
 
 
 def coarse_decomposition(incidence: Sequence[Collection[int]], n_variables: int) -> CoarseDecomposition:
@@ -91,8 +152,8 @@ def coarse_decomposition(incidence: Sequence[Collection[int]], n_variables: int)
 
     unpaired_equations = [i for i, variable in enumerate(variable_of) if variable is None]
     unpaired_variables = [j for j, equation in enumerate(equation_of) if equation is None]
-    over_equations, over_variables = _alternating_reach(unpaired_equations, incidence, equation_of)
-    under_variables, under_equations = _alternating_reach(unpaired_variables, occurs_in, variable_of)
+    over_equations, over_variables = alternating_reach(unpaired_equations, incidence, equation_of)
+    under_variables, under_equations = alternating_reach(unpaired_variables, occurs_in, variable_of)
     regular_equations = set(range(len(incidence))) - over_equations - under_equations
     regular_variables = set(range(n_variables)) - over_variables - under_variables
     parts = (over_equations, over_variables, under_equations, under_variables, regular_equations, regular_variables)
@@ -108,7 +169,7 @@ def require_nonsingular(incidence: Sequence[Collection[int]], n_variables: int) 
     raise StructurallySingular(parts.over_equations, parts.under_variables)
 
 
-def _alternating_reach(
+def alternating_reach(
     starts: Sequence[int], neighbours: Sequence[Collection[int]], partner: Sequence[int | None]
 ) -> tuple[set[int], set[int]]:
     """What alternating paths from `starts` reach: on the side of the starts, and on the other side."""

@@ -7,7 +7,7 @@ highest derivative σ_ij of each variable j that occurs in it.
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from .matching import require_nonsingular
+from .matching import alternating_reach, maximum_matching, require_nonsingular
 
 
 class Pantelides(NamedTuple):
@@ -29,9 +29,10 @@ def pantelides(signature: Sequence[Mapping[int, int]], n_variables: int | None =
     """Differentiates the fewest equations until the highest derivatives can be paired with the equations.
 
     `signature[i]` maps each variable of equation i to the order of its highest derivative there. `n_variables` is the
-    number of equations unless given. Equations are paired one after the other by augmenting paths among the highest
-    derivatives only; where no path exists, the equations and variables that the search reached are differentiated once
-    more, which keeps the pairs made so far. Raises `StructurallySingular` for a system on which this would not end.
+    number of equations unless given. Equations are paired among the highest derivatives only, σ_ij + c_i = d_j, as many as can
+    be; those that are left, and all equations and variables that alternating paths reach from them, are differentiated once
+    more, which keeps the pairs made so far. What is found does not depend on the order in which that is done. Raises
+    `StructurallySingular` for a system on which this would not end.
 
     Source: C. C. Pantelides, The consistent initialization of differential-algebraic systems, SIAM J. Sci. Stat.
     Comput. 9 (1988), algorithm 3.1.
@@ -44,44 +45,31 @@ def pantelides(signature: Sequence[Mapping[int, int]], n_variables: int | None =
         for variable, order in row.items():
             orders[variable] = max(orders[variable], order)
 
-    equation_of: list[int | None] = [None] * n_variables
-    variable_of = [-1] * len(signature)
-    for start in range(len(signature)):
-        free, equations, reached_from = _search(start, signature, offsets, orders, equation_of)
-        while free is None:
-            for equation in equations:
-                offsets[equation] += 1
-            for variable in reached_from:
-                orders[variable] += 1
-            free, equations, reached_from = _search(start, signature, offsets, orders, equation_of)
-        while free != -1:
-            equation = reached_from[free]
-            equation_of[free], variable_of[equation], free = equation, free, variable_of[equation]
-    return Pantelides(tuple(offsets), tuple(orders), tuple(variable_of))
+    highest = _HighestDerivatives(signature, offsets, orders)
+    matching = maximum_matching(highest, n_variables)
+    while unpaired := [equation for equation, variable in enumerate(matching) if variable is None]:
+        equation_of: list[int | None] = [None] * n_variables
+        for equation, variable in enumerate(matching):
+            if variable is not None:
+                equation_of[variable] = equation
+        equations, variables = alternating_reach(unpaired, highest, equation_of)
+        for equation in equations:
+            offsets[equation] += 1
+        for variable in variables:
+            orders[variable] += 1
+        matching = maximum_matching(highest, n_variables, matching)
+    return Pantelides(tuple(offsets), tuple(orders), tuple(j for j in matching if j is not None))
 
 
-def _search(
-    start: int,
-    signature: Sequence[Mapping[int, int]],
-    offsets: Sequence[int],
-    orders: Sequence[int],
-    equation_of: Sequence[int | None],
-) -> tuple[int | None, list[int], dict[int, int]]:
-    """Searches an augmenting path from equation `start` through highest derivatives, σ_ij + c_i = d_j.
+class _HighestDerivatives(Sequence[list[int]]):
+    """For each equation, differentiated as often as now, the variables whose highest derivative is in it."""
 
-    Gives the free variable at its end or `None`, the equations reached, and for each variable reached the equation
-    that it was reached from.
-    """
-    reached_from: dict[int, int] = {}
-    equations = [start]
-    for equation in equations:
-        offset = offsets[equation]
-        for variable, order in signature[equation].items():
-            if order + offset != orders[variable] or variable in reached_from:
-                continue
-            reached_from[variable] = equation
-            owner = equation_of[variable]
-            if owner is None:
-                return variable, equations, reached_from
-            equations.append(owner)
-    return None, equations, reached_from
+    def __init__(self, signature: Sequence[Mapping[int, int]], offsets: list[int], orders: list[int]) -> None:
+        self.signature, self.offsets, self.orders = signature, offsets, orders
+
+    def __len__(self) -> int:
+        return len(self.signature)
+
+    def __getitem__(self, i: int) -> list[int]:  # type: ignore[override]
+        offset = self.offsets[i]
+        return [j for j, order in self.signature[i].items() if order + offset == self.orders[j]]

@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from .blocks import block_triangular
-from .matching import require_nonsingular
+from .matching import maximum_matching, require_nonsingular
 
 
 class SigmaAnalysis(NamedTuple):
@@ -54,18 +54,26 @@ def sigma_method(signature: Sequence[Mapping[int, int]], n_variables: int | None
 def highest_value_transversal(signature: Sequence[Mapping[int, int]]) -> list[int]:
     """The variable of each equation in a pairing with the greatest Σ σ_ij, of a structurally nonsingular system.
 
-    Equations join one by one along a shortest augmenting path in the reduced costs u_i + v_j − σ_ij ≥ 0; O(n · entries ·
-    log n) at worst.
+    As many as can be are paired among the highest derivatives of the variables; the others join one by one along a shortest
+    augmenting path in the reduced costs u_i + v_j − σ_ij ≥ 0; O(n · entries · log n) at worst.
 
     Source: R. Jonker, A. Volgenant, A shortest augmenting path algorithm for dense and sparse linear assignment
     problems, Computing 38 (1987).
     """
     n = len(signature)
-    u = [max(row.values()) for row in signature]
     v = [0] * n
-    equation_of: list[int] = [-1] * n
-    variable_of = [-1] * n
-    for start in range(n):
+    for row in signature:
+        for variable, order in row.items():
+            v[variable] = max(v[variable], order)
+    u = [max(order - v[variable] for variable, order in row.items()) for row in signature]
+    cheapest = [[j for j, order in row.items() if u[i] + v[j] == order] for i, row in enumerate(signature)]
+    paired = maximum_matching(cheapest, n)
+    equation_of = [-1] * n
+    variable_of = [-1 if variable is None else variable for variable in paired]
+    for equation, variable in enumerate(variable_of):
+        if variable != -1:
+            equation_of[variable] = equation
+    for start in [equation for equation, variable in enumerate(paired) if variable is None]:
         distance: dict[int, int] = {}
         reached_from: dict[int, int] = {}
         settled: dict[int, int] = {}

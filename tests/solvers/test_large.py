@@ -50,7 +50,15 @@ def exact(t, x, k):
 
 def solve(solver, y0, k, rtol=1e-7, **options):
     return dae_jax.daesolve(
-        SYSTEM, solver, START, 1.5, None, y0, k, stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol), **options
+        SYSTEM,
+        solver,
+        START,
+        1.5,
+        None,
+        y0,
+        k,
+        stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol),
+        **options,
     )
 
 

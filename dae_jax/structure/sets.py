@@ -1,0 +1,264 @@
+"""Sets of inputs as numbers: a union is made once and looked up after that; what is in the sets is found at the end.
+
+The table is a binary decision diagram's unique table in its simplest form: equal pairs have equal ids. Equal ids are equal
+sets; the converse does not hold, for which there is `Sets.equal`.
+
+Source: J.-C. Filliâtre, S. Conchon, Type-safe modular hash-consing, Workshop on ML (2006).
+"""
+
+from array import array
+
+import numpy as np
+from jaxtyping import Int
+from scipy.sparse import csr_array
+
+
+# An array of ids; an entry is the set that an entry of another array depends on.
+Ids = Int[np.ndarray, "..."]
+
+# Unions of fewer entries are made one by one: numpy takes longer to begin.
+FEW = 64
+
+
+class Sets:
+    """Unions of single elements, by their ids: 0 is the empty set, 1 to `n` hold one input each.
+
+    Of what is reached through a *jump* (a comparison, rounding, a truth value) this is remembered beside: `through_jump`. With
+    `slopes_only` such sets are empty.
+
+    Node k stands for `left[k]` ∪ `right[k]`, both smaller ids; where `left[k]` is 0, for `right[k]` reached through a jump.
+    `level` is the length of the longest way from a node to single elements, whose level is 0.
+    """
+
+    def __init__(self, n: int, slopes_only: bool = False) -> None:
+        self.slopes_only = slopes_only
+        self.left, self.right, self.level = array("q"), array("q"), array("q")
+        self._known: dict[int, int] = {}
+        self._runs: list[tuple[np.ndarray, np.ndarray]] = []
+        self._append(np.zeros(1 + n, np.int64), np.zeros(1 + n, np.int64), np.zeros(1 + n, np.int64))
+
+    def __len__(self) -> int:
+        """How many sets there are, also those that nothing refers to any more."""
+        return len(self.left)
+
+    def elements(self, count: int) -> Ids:
+        """The ids of sets of a new element each."""
+        first, zeros = len(self), np.zeros(count, np.int64)
+        self._append(zeros, zeros, zeros)
+        return np.arange(first, first + count)
+
+    # Unions
+
+    def union(self, a: Ids, b: Ids) -> Ids:
+        """Entry by entry; the shapes broadcast."""
+        if a.size < FEW and b.size < FEW:
+            if a.shape != b.shape:
+                a, b = np.broadcast_arrays(a, b)
+            return np.array(list(map(self._pair, a.ravel().tolist(), b.ravel().tolist())), np.int64).reshape(a.shape)
+        low, high = np.minimum(a, b), np.maximum(a, b)
+        both = (low > 0) & (low < high)
+        if both.any():
+            high[both] = self._looked_up(low[both] << 32 | high[both])
+        return high
+
+    def through_jump(self, a: Ids) -> Ids:
+        """The same elements, all of them reached through a jump."""
+        if self.slopes_only or not a.any():
+            return np.zeros_like(a)
+        if a.size < FEW:
+            return np.array(list(map(self._jumped, a.ravel().tolist())), np.int64).reshape(a.shape)
+        left, level = np.frombuffer(self.left, np.int64), np.frombuffer(self.level, np.int64)
+        new = (a > 0) & ((left[a] > 0) | (level[a] == 0))
+        del left, level
+        found = a.copy()
+        found[new] = self._looked_up(a[new])
+        return found
+
+    def over(self, a: Ids, axes: tuple[int, ...], keepdims: bool = False) -> Ids:
+        """The union along `axes`, in halves: log n unions, one in the other."""
+        shape = [1 if axis in axes else size for axis, size in enumerate(a.shape)]
+        rest = [size for axis, size in enumerate(a.shape) if axis not in axes]
+        a = np.moveaxis(a, axes, range(len(axes))).reshape(int(np.prod([a.shape[axis] for axis in axes])), *rest)
+        while len(a) > 1:
+            half = len(a) // 2
+            joined = self.union(a[:half], a[half : 2 * half])
+            a = np.concatenate([joined, a[2 * half :]]) if len(a) % 2 else joined
+        found = a[0] if len(a) else np.zeros(rest, np.int64)
+        return found.reshape(shape) if keepdims else found
+
+    def accumulated(self, a: Ids) -> Ids:
+        """The unions a₀, a₀ ∪ a₁, … along the first axis, of fewer than twice as many pairs.
+
+        Source: R. P. Brent, H. T. Kung, A regular layout for parallel adders, IEEE Trans. Comput. C-31 (1982).
+        """
+        if len(a) < 2:
+            return a
+        found = a.copy()
+        found[1::2] = self.accumulated(self.union(a[:-1:2], a[1::2]))
+        found[2::2] = self.union(found[1:-1:2], a[2::2])
+        return found
+
+    def at(self, a: Int[np.ndarray, " n"], places: Int[np.ndarray, " k"], new: Int[np.ndarray, " k"]) -> Ids:
+        """`a` with each of the `new` sets joined at its place, of which there may be several at one."""
+        found = a.copy()
+        if len(places) < FEW:
+            for place, one in zip(places.tolist(), new.tolist(), strict=True):
+                found[place] = self._pair(int(found[place]), one)
+            return found
+        order = np.argsort(places, kind="stable")
+        places, new = places[order], new[order]
+        while True:
+            first = np.flatnonzero(np.diff(places, prepend=-1))
+            if len(first) == len(places):
+                break
+            rank = np.arange(len(places)) - np.repeat(first, np.diff(first, append=len(places)))
+            even = np.flatnonzero(rank % 2 == 0)
+            partner = np.minimum(even + 1, len(places) - 1)
+            places, new = places[even], self.union(new[even], np.where(rank[partner] % 2, new[partner], 0))
+        found[places] = self.union(a[places], new)
+        return found
+
+    # What is in them
+
+    def equal(self, a: Ids, b: Ids) -> bool:
+        """Whether all entries are the same sets, however they were made."""
+        unlike = a != b
+        if not unlike.any():
+            return True
+        return all(
+            np.array_equal(x.indptr, y.indptr) and np.array_equal(x.indices, y.indices)
+            for x, y in zip(self.rows(a[unlike]), self.rows(b[unlike]), strict=True)
+        )
+
+    def rows(self, a: Ids) -> tuple[csr_array, csr_array]:
+        """The sets as rows of truth values, a column for each id of a single element, and those of what is reached through
+        jumps.
+        """
+        ids, which = np.unique(a, return_inverse=True)
+        first, length, columns = self._contents(ids)
+        rows, entries = ragged(first[ids[which.reshape(-1)]], length[ids[which.reshape(-1)]])
+        columns = columns[entries]
+        shape = (a.size, len(self))
+        return tuple(_matrix(rows[part], columns[part] // 2, shape) for part in (columns % 2 == 0, columns % 2 == 1))  # type: ignore[return-value]
+
+    def _contents(self, roots: Int[np.ndarray, " k"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where the elements of each set begin, how many they are, and all of them, for the `roots`: 2 k for the element of id
+        k, 2 k + 1 for that through a jump.
+
+        From the single elements upward, level by level, what is needed for the roots. A node that only one other refers to is
+        not looked at by itself: the long chains of a loop count once.
+        """
+        left, right, level = (np.array(x) for x in (self.left, self.right, self.level))
+        needed = np.zeros(len(left), bool)
+        needed[roots] = True
+        by_level = np.argsort(level, kind="stable")
+        ends = np.searchsorted(level[by_level], np.arange(level[roots].max(initial=0) + 2))
+        for low, high in zip(ends[-2:0:-1], ends[:1:-1], strict=True):
+            nodes = by_level[low:high]
+            nodes = nodes[needed[nodes]]
+            needed[left[nodes]] = needed[right[nodes]] = True
+        needed[0] = False
+        inner, single = np.flatnonzero(needed & (level > 0)), np.flatnonzero(needed & (level == 0))
+
+        jumped = np.zeros(len(left), bool)
+        jumped[inner] = left[inner] == 0
+        parents = np.bincount(left[inner], minlength=len(left)) + np.bincount(right[inner], minlength=len(left))
+        kept = needed & ((level == 0) | (parents != 1) | jumped)
+        kept[roots] = kept[right[jumped]] = True
+        owner = np.arange(len(left))
+        for child in (left[inner], right[inner]):
+            alone = ~kept[child] & (child > 0)
+            owner[child[alone]] = inner[alone]
+        while (owner[owner] != owner).any():
+            owner = owner[owner]
+        of, child = np.tile(owner[inner], 2), np.concatenate([left[inner], right[inner]])
+        edge = kept[child] & (child > 0)
+        order = np.argsort(level[of[edge]], kind="stable")
+        of, child = of[edge][order], child[edge][order]
+
+        first, length = np.zeros(len(left), np.int64), np.zeros(len(left), np.int64)
+        first[single], length[single] = np.arange(len(single)), 1
+        columns, used = 2 * single, len(single)
+        for edges in np.split(np.arange(len(of)), np.flatnonzero(np.diff(level[of])) + 1):
+            which, entries = ragged(first[child[edges]], length[child[edges]])
+            nodes, found = of[edges][which], columns[entries]
+            through = jumped[nodes]
+            nodes, found = np.append(nodes, nodes[through]), np.append(found, found[through] | 1)
+            nodes, found = np.divmod(np.unique(nodes * (2 * len(left)) + found), 2 * len(left))
+            if used + len(found) > len(columns):
+                columns = np.append(columns, np.zeros(used + len(found), np.int64))
+            columns[used : used + len(found)] = found
+            begins = np.flatnonzero(np.diff(nodes, prepend=-1))
+            first[nodes[begins]] = used + begins
+            length[nodes[begins]] = np.diff(begins, append=len(nodes))
+            used += len(found)
+        return first, length, columns
+
+    # The table
+
+    def _pair(self, a: int, b: int) -> int:
+        """The union of two."""
+        if a == b or not b:
+            return a
+        if not a:
+            return b
+        if a > b:
+            a, b = b, a
+        return b if a in (self.left[b], self.right[b]) else self._node(a, b)
+
+    def _jumped(self, a: int) -> int:
+        """A set reached through a jump."""
+        return a if not a or (self.level[a] and not self.left[a]) else self._node(0, a)
+
+    def _node(self, a: int, b: int) -> int:
+        """The id of a pair."""
+        found = self._known.setdefault(a << 32 | b, len(self.left))
+        if found == len(self.left):
+            self.left.append(a)
+            self.right.append(b)
+            self.level.append(1 + max(self.level[a], self.level[b]))
+        return found
+
+    def _looked_up(self, keys: Int[np.ndarray, " k"]) -> Int[np.ndarray, " k"]:
+        """The ids of pairs (a, b), given as 2³² a + b: known ones, or new ones."""
+        keys, which = np.unique(keys, return_inverse=True)
+        found = np.zeros_like(keys)
+        for known, ids in self._runs:
+            at = np.minimum(np.searchsorted(known, keys), len(known) - 1)
+            found = np.where(known[at] == keys, ids[at], found)
+        new = np.flatnonzero(found == 0)
+        a, b = keys[new] >> 32, keys[new] & 0xFFFFFFFF
+        left, right, level = (np.frombuffer(x, np.int64) for x in (self.left, self.right, self.level))
+        within = (a > 0) & ((left[b] == a) | (right[b] == a))
+        levels = 1 + np.maximum(level[a], level[b])
+        del left, right, level  # which would keep the table from growing
+        found[new] = np.where(within, b, len(self) + np.cumsum(~within) - 1)
+        self._append(a[~within], b[~within], levels[~within])
+        self._remember(keys[new], found[new])
+        return found[which]
+
+    def _remember(self, keys: np.ndarray, ids: np.ndarray) -> None:
+        """Sorted runs, each more than the one after it: as many as the logarithm of their length."""
+        while self._runs and len(self._runs[-1][0]) <= len(keys):
+            known, of_known = self._runs.pop()
+            keys, ids = np.append(known, keys), np.append(of_known, ids)
+            order = np.argsort(keys, kind="stable")
+            keys, ids = keys[order], ids[order]
+        if len(keys):
+            self._runs.append((keys, ids))
+
+    def _append(self, *columns: np.ndarray) -> None:
+        for stored, column in zip((self.left, self.right, self.level), columns, strict=True):
+            stored.frombytes(column.astype(np.int64).tobytes())
+
+
+def ragged(first: np.ndarray, length: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The places first, first + 1, …, as many as `length`, of one entry after the other, and which entry each belongs to."""
+    which = np.repeat(np.arange(len(length)), length)
+    return which, np.arange(len(which)) + np.repeat(first - np.cumsum(length) + length, length)
+
+
+def _matrix(rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int]) -> csr_array:
+    """With `True` at these places, which are in order."""
+    indptr = np.append(0, np.cumsum(np.bincount(rows, minlength=shape[0])))
+    return csr_array((np.ones(len(rows), bool), columns, indptr), shape)
