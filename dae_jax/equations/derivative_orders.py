@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import heapq
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
@@ -14,6 +15,7 @@ from jaxtyping import Array, Inexact
 from scipy.sparse import csr_array
 
 from ..linalg.dense import LOOPED
+from ..linalg.rank import has_all_pivots
 from ..structure import (
     SigmaAnalysis,
     StructurallySingular,
@@ -261,31 +263,56 @@ def _may_cancel(pattern: list[list[int]]) -> list[int]:
     return sorted(left)
 
 
-def _left_null_vectors(rows: Sequence[Mapping[tuple[int, Any], float]]) -> list[dict[int, float]]:
-    """The combinations of rows, given as polynomials over their columns, that vanish; by elimination."""
-    place: dict[Any, int] = {}
-    for row in rows:
-        for at in row:
-            place.setdefault(at, len(place))
-    basis: list[tuple[int, np.ndarray, np.ndarray]] = []
+def _left_null_vectors(rows: Sequence[Mapping[Any, float]]) -> list[dict[int, float]]:
+    """The combinations of rows, given as polynomials over their columns, that vanish; by sparse elimination."""
+    if len(rows) > LOOPED and _are_independent(rows):
+        return []
+    basis: list[tuple[Any, dict[Any, float], dict[int, float]]] = []
+    eliminates: dict[Any, int] = {}
     found = []
     for i, row in enumerate(rows):
-        values, combined = np.zeros(len(place)), np.eye(len(rows))[i]
-        for at, a in row.items():
-            values[place[at]] = a
-        size = np.abs(values)
-        for pivot, other, how in basis:
-            factor = values[pivot] / other[pivot]
-            size = size + np.abs(factor * other)
-            values, combined = values - factor * other, combined - factor * how
-            values[pivot] = 0
-        values = np.where(np.abs(values) <= 1e-12 * size, 0, values)
-        if values.any():
-            basis.append((int(np.argmax(np.abs(values))), values, combined))
+        values, sizes, combined = dict(row), {at: abs(a) for at, a in row.items()}, {i: 1.0}
+        # A row of the basis has no pivot of those before it: what it brings in is eliminated later.
+        left = [eliminates[at] for at in values if at in eliminates]
+        heapq.heapify(left)
+        while left:
+            pivot, other, how = basis[heapq.heappop(left)]
+            factor = values.pop(pivot, 0.0) / other[pivot]
+            for at, a in other.items():
+                if at != pivot:
+                    if at not in values and at in eliminates:
+                        heapq.heappush(left, eliminates[at])
+                    values[at] = values.get(at, 0.0) - factor * a
+                    sizes[at] = sizes.get(at, 0.0) + abs(factor * a)
+            for k, a in how.items():
+                combined[k] = combined.get(k, 0.0) - factor * a
+        values = {at: a for at, a in values.items() if abs(a) > 1e-12 * sizes[at]}
+        if values:
+            pivot = max(values, key=lambda at: abs(values[at]))
+            eliminates[pivot] = len(basis)
+            basis.append((pivot, values, combined))
         else:
-            used = np.abs(combined) > 1e-12 * np.abs(combined).max()
-            found.append({int(k): float(combined[k]) for k in np.flatnonzero(used)})
+            largest = max(map(abs, combined.values()))
+            found.append({k: a for k, a in sorted(combined.items()) if abs(a) > 1e-12 * largest})
     return found
+
+
+def _are_independent(rows: Sequence[Mapping[Any, float]]) -> bool:
+    """Whether rows of polynomials, keyed by (column, monomial), are so for some numbers in place of their monomials: then no
+    combination of them vanishes. False where that is not seen.
+    """
+    rng = np.random.default_rng(0)
+    numbers: dict[Any, float] = {}
+    columns: dict[Any, int] = {}
+    entries = [
+        (i, columns.setdefault(j, len(columns)), a * numbers.setdefault(m, rng.uniform(1, 2)))
+        for i, row in enumerate(rows)
+        for (j, m), a in row.items()
+    ]
+    if len(columns) != len(rows):
+        return False
+    i, j, a = map(np.array, zip(*entries, strict=True))
+    return has_all_pivots(csr_array((a, (i, j)), shape=(len(rows), len(columns))))
 
 
 def derivative_of(equation: str, times: int) -> str:

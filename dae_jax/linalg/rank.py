@@ -60,3 +60,17 @@ def _condition(matrix: csr_array) -> float:
         matrix.shape, factors.solve, rmatvec=transposed, matmat=factors.solve, rmatmat=transposed, dtype=matrix.dtype
     )
     return float(abs(matrix).sum(0).max() * onenormest(inverse))
+
+
+def has_all_pivots(matrix: csr_array) -> bool:
+    """Whether elimination with partial pivoting finds a pivot beyond round-off in every row, which are scaled to a greatest entry
+    of 1.
+    """
+    rows = np.abs(matrix).max(1).toarray().reshape(-1)
+    if not rows.all():
+        return False
+    try:
+        factors = splu((diags_array(1 / rows) @ matrix).tocsc())
+    except RuntimeError:
+        return False
+    return float(np.abs(factors.U.diagonal()).min()) > np.finfo(float).eps ** 0.5
