@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -144,7 +145,16 @@ class Structure:
 
     def hidden_constraints(self) -> tuple[tuple[str, int], ...]:
         """Which equations, differentiated how often, restrict the initial values: those of lower order than cᵢ."""
-        return tuple((self.equations[i], k) for i, c in enumerate(self.equation_offsets) for k in range(c))
+        names = self.equations
+        return tuple((names[i], k) for i, c in enumerate(self.equation_offsets) for k in range(c))
+
+    @property
+    def _blocks_in_words(self) -> str:
+        """How many there are; of many, how many of each size, the largest first."""
+        sizes = sorted(Counter(len(block.equations) for block in self.blocks).items(), reverse=True)
+        if len(self.equations) <= DRAWN or len(sizes) > HIDDEN:
+            return counted(len(self.blocks), "block")
+        return " and ".join(f"{counted(number, 'block')} of {counted(size, 'equation')}" for size, number in sizes)
 
     def __str__(self) -> str:
         freedom = counted(self.degrees_of_freedom, "initial value") + " to choose"
@@ -153,7 +163,7 @@ class Structure:
             freedom = f"{counted(self.mechanical_degrees_of_freedom, *many)} ({freedom})"
         lines = [
             f"{counted(len(self.equations), 'equation')}, index {self.index}, {freedom}, "
-            f"{counted(len(self.blocks), 'block')}, {counted(self.nonzeros, 'nonzero')}, bandwidth {self.bandwidth}",
+            f"{self._blocks_in_words}, {counted(self.nonzeros, 'nonzero')}, bandwidth {self.bandwidth}",
         ]
         if not self.regular:
             lines.append(
@@ -185,7 +195,7 @@ class Structure:
             "degrees of freedom": "" if freedom is None else f"{freedom}, of the mechanism",
             "initial values to choose": str(self.degrees_of_freedom),
             "hidden constraints": _named(self.hidden_constraints()),
-            "blocks": str(len(self.blocks)),
+            "blocks": self._blocks_in_words,
             "nonzeros, bandwidth": f"{self.nonzeros}, {self.bandwidth}",
             "system Jacobian": "regular near the given state" if self.regular else "singular near the given state",
         }

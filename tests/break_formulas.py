@@ -223,8 +223,8 @@ BREAKS = {
         "structure/sigma.py", "(1 if 0 in d else 0)", "0", "tests/structure/test_structure.py::test_published_offsets"
     ),
     "Pantelides: highest derivatives": Break(
-        "structure/pantelides.py", "for variable in reached_from:\n                orders[variable] += 1",
-        "for variable in reached_from:\n                orders[variable] += 2",
+        "structure/pantelides.py", "for variable in variables:\n            orders[variable] += 1",
+        "for variable in variables:\n            orders[variable] += 2",
         "tests/structure/test_structure.py::test_sigma_method_and_pantelides_agree",
     ),
     "index of a variable": Break(

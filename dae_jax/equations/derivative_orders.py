@@ -327,10 +327,10 @@ def _sign(factor: float, place: int) -> str:
 
 def _singular(form: Form, singular: StructurallySingular) -> str:
     parts = []
-    if singular.equations:
-        names = in_short([form.equations[i] for i in singular.equations])
-        parts.append(f"the equations {names} have too few variables between them")
-    if singular.variables:
-        names = in_short([form.variables[j] for j in singular.variables])
-        parts.append(f"the variables {names} have too few equations between them")
+    for kind, places, of, lack in (
+        ("equations", singular.equations, form.equations, "variables"),
+        ("variables", singular.variables, form.variables, "equations"),
+    ):
+        if places:
+            parts.append(f"the {kind} {in_short([of[k] for k in places])} have too few {lack} between them")
     return f"The system is structurally singular: {'; '.join(parts)}."

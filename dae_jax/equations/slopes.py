@@ -10,8 +10,8 @@ from jaxtyping import Array, Float, Int
 from scipy.sparse import csr_array
 
 from ..compiler import Polynomial, polynomials
-from ..structure import column_colouring, seed_matrix
-from ..types import DType, Flat, Scalar
+from ..structure import column_colouring, seed_matrix, shape_of
+from ..types import DType, Flat, Scalar, Time
 from .taylor import total_derivatives
 
 
@@ -36,20 +36,25 @@ class Slopes:
         self.full = np.flatnonzero(many)
         self.colours = column_colouring(self.pattern[np.flatnonzero(~many)])
         self.residual, self.degree, self.dtype = residual, degree, dtype
-        self.shape = (degree + 2, pattern.shape[1])
+        self.shape = (degree + 2, shape_of(pattern)[1])
 
     def _levels(self, t: Scalar, orders: Float[Array, "orders n"]) -> Float[Array, "levels n"]:
         return jnp.stack(total_derivatives(self.residual, t, list(orders), self.degree + 1))
 
-    def along(self, t: Scalar, orders: Float[Array, "orders n"]) -> Float[Array, "directions levels n"]:
-        """The directional derivatives at t and (y, ẏ, …)."""
-        directions = np.kron(np.eye(self.shape[0]), seed_matrix(self.colours).T).reshape(-1, *self.shape)
-        slope = lambda v: jax.jvp(lambda orders: self._levels(t, orders), (orders,), (v,))[1]
-        return jax.vmap(slope)(jnp.asarray(directions, self.dtype))
+    @property
+    def directions(self) -> Float[np.ndarray, "directions orders n"]:
+        """Each colour, of each order."""
+        return np.kron(np.eye(self.shape[0]), seed_matrix(self.colours).T).reshape(-1, *self.shape)
 
-    def at(self, t: Scalar, orders: Float[Array, "orders n"]) -> tuple[np.ndarray, np.ndarray]:
+    def along(
+        self, t: Scalar, orders: Float[Array, "orders n"], directions: Float[Array, "directions orders n"]
+    ) -> Float[Array, "directions levels n"]:
+        """The directional derivatives at t and (y, ẏ, …)."""
+        return jax.vmap(lambda v: jax.jvp(lambda orders: self._levels(t, orders), (orders,), (v,))[1])(directions)
+
+    def at(self, t: Time, orders: Float[Array, "orders n"]) -> tuple[np.ndarray, np.ndarray]:
         """What `along` gives, and the gradients of full equations, as numbers: (levels, equations, orders, n)."""
-        along = np.asarray(jax.jit(self.along)(t, orders))
+        along = np.asarray(jax.jit(self.along)(t, orders, jnp.asarray(self.directions, self.dtype)))
         if not len(self.full):
             return along, np.zeros((self.degree + 1, 0, *self.shape))
         rows = lambda t, orders: self._levels(t, orders)[:, self.full]
@@ -80,7 +85,8 @@ class Slopes:
         """For each derivative and each equation, by order and variable; `None` where they have no such form."""
         if len(self.full):
             return None
-        found = polynomials(self.along, *(jax.ShapeDtypeStruct(shape, self.dtype) for shape in ((), self.shape)))
+        along = lambda t, orders: self.along(t, orders, jnp.asarray(self.directions, self.dtype))
+        found = polynomials(along, *(jax.ShapeDtypeStruct(shape, self.dtype) for shape in ((), self.shape)))
         if found is None:
             return None
         return [[self.by_entry(found, k, i) for i in range(self.shape[1])] for k in range(self.degree + 1)]

@@ -3,11 +3,10 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.sparse.csgraph import structural_rank
 
 from ..equations.derivative_orders import find_offsets
 from ..equations.residual_form import Form, ResidualForm
-from ..structure import dependence, in_short
+from ..structure import dependence_patterns, in_short, maximum_matching, variables_of
 from ..systems import System
 from ..types import Args, State, Time
 
@@ -33,11 +32,13 @@ def why_not_as_written(system: System, t: Time, state: State, args: Args, form: 
     if found.index > highest:
         beyond = [name for name, k in zip(residual.variables, found.indices, strict=True) if k > highest]
         return f"the index of {in_short(beyond)} is {found.index}, and it converges for an index up to {highest}"
-    if found.index < 2 or structural_rank(found.by_rate) == len(np.unique(found.by_rate.indices)):
+    independent = [j for j in maximum_matching(variables_of(found.by_rate), residual.size) if j is not None]
+    if found.index < 2 or len(independent) == len(np.unique(found.by_rate.indices)):
         return ""
     y, time = jax.ShapeDtypeStruct((residual.size,), dtype), jax.ShapeDtypeStruct((), dtype)
-    on = dependence(jax.jacfwd(residual.residual, 2), time, y, y, derivative=True)
-    if not np.concatenate(on, 1).any():
+    slope = lambda t, y, yd, v: jax.jvp(lambda yd: residual.residual(t, y, yd), (yd,), (v,))[1]
+    *varies, _ = dependence_patterns(slope, time, y, y, y, derivative=True)
+    if not any(pattern.nnz for pattern in varies):
         return ""
     return (
         f"the index is {found.index}, and there are fewer equations with derivatives than variables whose derivative occurs, "

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array
-from scipy.sparse.linalg import LinearOperator, onenormest, splu
+from scipy.sparse.linalg import LinearOperator, SuperLU, onenormest, splu
 
 from ..structure import Block
 
@@ -21,25 +21,26 @@ def is_nonsingular(matrix: csr_array, blocks: Sequence[Block], eps: float) -> bo
 
     Source: N. J. Higham, F. Tisseur, A block algorithm for matrix 1-norm estimation, SIAM J. Matrix Anal. Appl. 21 (2000).
     """
-    rows = np.abs(matrix).max(1).toarray().reshape(-1)
+    rows = abs(matrix).max(1).toarray().reshape(-1)
     if not (np.isfinite(matrix.data).all() and (rows > 0).all()):
         return False
     scaled = csr_array(diags_array(1 / rows) @ matrix)
     sizes = np.array([len(block.equations) for block in blocks])
     values = [np.zeros(0)]
     for size in np.unique(sizes[sizes <= DENSE]):
-        values.append(_singular_values(scaled, [blocks[k] for k in np.flatnonzero(sizes == size)]))
+        of_size = [blocks[int(k)] for k in np.flatnonzero(sizes == size)]
+        values.append(_singular_values(scaled, of_size, len(rows)))
     found = np.concatenate(values)
     if found.min(initial=1) <= 100 * len(rows) * eps * found.max(initial=0):
         return False
-    large = [blocks[k] for k in np.flatnonzero(sizes > DENSE)]
+    large = [block for block in blocks if len(block.equations) > DENSE]
     return all(_condition(scaled[list(block.equations)][:, list(block.variables)]) < 1e-3 / eps for block in large)
 
 
-def _singular_values(matrix: csr_array, blocks: Sequence[Block]) -> np.ndarray:
-    """Of all blocks, which are of one size."""
+def _singular_values(matrix: csr_array, blocks: Sequence[Block], count: int) -> np.ndarray:
+    """Of the blocks, which are of one size, of a matrix with `count` columns."""
     equations, variables = (np.array(part) for part in zip(*blocks, strict=True))
-    block_of, place_of = np.full(matrix.shape[1], -1), np.zeros(matrix.shape[1], int)
+    block_of, place_of = np.full(count, -1), np.zeros(count, int)
     block_of[variables], place_of[variables] = np.indices(variables.shape)
     part = matrix[equations.reshape(-1)].tocoo()
     block, row = np.divmod(part.row, variables.shape[1])
@@ -55,11 +56,21 @@ def _condition(matrix: csr_array) -> float:
         factors = splu(matrix.tocsc())
     except RuntimeError:
         return np.inf
-    transposed = lambda b: factors.solve(b, "T")
-    inverse = LinearOperator(
-        matrix.shape, factors.solve, rmatvec=transposed, matmat=factors.solve, rmatmat=transposed, dtype=matrix.dtype
-    )
-    return float(abs(matrix).sum(0).max() * onenormest(inverse))
+    return float(abs(matrix).sum(0).max() * onenormest(_Inverse(factors)))
+
+
+class _Inverse(LinearOperator):
+    """A⁻¹, or A⁻ᵀ, from the factors of A."""
+
+    def __init__(self, factors: SuperLU, transposed: bool = False) -> None:
+        self.factors, self.transposed = factors, transposed
+        super().__init__(np.dtype(float), factors.shape)
+
+    def _matmat(self, x: np.ndarray) -> np.ndarray:
+        return self.factors.solve(x, "T" if self.transposed else "N")
+
+    def _adjoint(self) -> LinearOperator:
+        return _Inverse(self.factors, not self.transposed)
 
 
 def has_all_pivots(matrix: csr_array) -> bool:

@@ -24,7 +24,7 @@ from .ordering import (
     reverse_cuthill_mckee as reverse_cuthill_mckee,
 )
 from .pantelides import Pantelides as Pantelides, pantelides as pantelides
-from .patterns import Pattern as Pattern, signature as signature, variables_of as variables_of
+from .patterns import Pattern as Pattern, shape_of as shape_of, signature as signature, variables_of as variables_of
 from .sigma import (
     SigmaAnalysis as SigmaAnalysis,
     highest_value_transversal as highest_value_transversal,

@@ -6,22 +6,23 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import csr_array
 
-from .patterns import Pattern, variables_of
+from .patterns import Pattern, shape_of, variables_of
 
 
 def column_colouring(pattern: Pattern) -> Int[np.ndarray, " n"]:
     """A colour 0, 1, ... for each column, such that columns of one colour have no nonzero row in common.
 
     Greedy, in the order given and in smallest-last order, whichever needs fewer; a chain gets as many colours as its
-    fullest row has nonzeros, the least there can be; so does a pattern with a full row. With the 0-1 matrix S of `seed_matrix`, the compressed Jacobian
-    J S (one directional derivative a colour) holds every nonzero: J[i, j] = (J S)[i, colours[j]]. An empty column has
-    colour 0.
+    fullest row has nonzeros, the least there can be, and a pattern with a full row one a column. With the 0-1 matrix S of
+    `seed_matrix`, the compressed Jacobian J S (one directional derivative a colour) holds every nonzero:
+    J[i, j] = (J S)[i, colours[j]]. An empty column has colour 0.
 
     Source: A. H. Gebremedhin, F. Manne, A. Pothen, What color is your Jacobian?, SIAM Review 47 (2005), sections 3, 7.
     """
     pattern = csr_array(pattern)
-    if np.diff(pattern.indptr).max(initial=0) == pattern.shape[1]:
-        return np.arange(pattern.shape[1])
+    count = shape_of(pattern)[1]
+    if np.diff(pattern.indptr).max(initial=0) == count:
+        return np.arange(count)
     neighbours = _column_intersection_graph(pattern)
     orders = [list(range(len(neighbours))), _smallest_first(neighbours)[::-1]]
     return min((_greedy(neighbours, order) for order in orders), key=lambda colours: colours.max(initial=-1))

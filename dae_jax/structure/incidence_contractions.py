@@ -8,7 +8,8 @@ import numpy as np
 from ..compiler.types import Equation
 from ..types import DType
 from .cells import Cells, evaluate, unless
-from .sets import Sets, ragged
+from .set_elements import ragged
+from .sets import Sets
 
 
 # So many terms of a product of matrices are looked at together.

@@ -4,12 +4,14 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from jax.extend.core import ClosedJaxpr
+from scipy.sparse import csr_array
 
 from ..compiler.types import Equation
 from .blocks import block_triangular
 from .cells import Cells
 from .incidence_entries import together
 from .matching import maximum_matching
+from .patterns import variables_of
 from .sets import Ids, Sets
 
 
@@ -118,10 +120,9 @@ def linear_solve(eqn: Equation, inputs: list[Cells], run: Run, sets: Sets) -> li
         return _flat(run(eqn.params["jaxprs"].matvec, [*inputs[: lengths.matvec], *shaped(unknowns)]))
 
     own = sets.union(times(np.zeros(n, np.int64)), _flat(right))
-    unknowns = sets.elements(n)
+    unknowns = sets.new_elements(n)
     on, jumps = sets.rows(times(unknowns))
-    pattern = (on + jumps)[:, unknowns]
-    rows = [part.tolist() for part in np.split(pattern.indices, pattern.indptr[1:-1])]
+    rows = variables_of(csr_array(on + jumps)[:, unknowns])
     nonzero = np.concatenate([part.nonzero.reshape(-1) for part in right])
     return shaped(_solve_blocks(rows, own, nonzero, sets))
 

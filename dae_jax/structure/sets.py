@@ -12,12 +12,14 @@ import numpy as np
 from jaxtyping import Int
 from scipy.sparse import csr_array
 
+from .set_elements import elements, listed_elements
+
 
 # An array of ids; an entry is the set that an entry of another array depends on.
 Ids = Int[np.ndarray, "..."]
 
-# Unions of fewer entries are made one by one: numpy takes longer to begin.
-FEW = 64
+# Unions of fewer entries, and the contents of fewer sets, are found one by one: numpy takes longer to begin.
+FEW, FEW_NODES = 64, 512
 
 
 class Sets:
@@ -41,7 +43,7 @@ class Sets:
         """How many sets there are, also those that nothing refers to any more."""
         return len(self.left)
 
-    def elements(self, count: int) -> Ids:
+    def new_elements(self, count: int) -> Ids:
         """The ids of sets of a new element each."""
         first, zeros = len(self), np.zeros(count, np.int64)
         self._append(zeros, zeros, zeros)
@@ -55,7 +57,7 @@ class Sets:
             if a.shape != b.shape:
                 a, b = np.broadcast_arrays(a, b)
             return np.array(list(map(self._pair, a.ravel().tolist(), b.ravel().tolist())), np.int64).reshape(a.shape)
-        low, high = np.minimum(a, b), np.maximum(a, b)
+        low, high = np.minimum(a, b), np.asarray(np.maximum(a, b))
         both = (low > 0) & (low < high)
         if both.any():
             high[both] = self._looked_up(low[both] << 32 | high[both])
@@ -134,65 +136,16 @@ class Sets:
         """The sets as rows of truth values, a column for each id of a single element, and those of what is reached through
         jumps.
         """
-        ids, which = np.unique(a, return_inverse=True)
-        first, length, columns = self._contents(ids)
-        rows, entries = ragged(first[ids[which.reshape(-1)]], length[ids[which.reshape(-1)]])
-        columns = columns[entries]
+        if len(self) < FEW_NODES:
+            length, columns = listed_elements(self.left, self.right, a.reshape(-1).tolist())
+        else:
+            left, right, level = (np.array(x) for x in (self.left, self.right, self.level))
+            length, columns = elements(left, right, level, a.reshape(-1))
+        rows, jumps = np.repeat(np.arange(a.size), length), columns % 2 == 1
         shape = (a.size, len(self))
-        return tuple(_matrix(rows[part], columns[part] // 2, shape) for part in (columns % 2 == 0, columns % 2 == 1))  # type: ignore[return-value]
-
-    def _contents(self, roots: Int[np.ndarray, " k"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Where the elements of each set begin, how many they are, and all of them, for the `roots`: 2 k for the element of id
-        k, 2 k + 1 for that through a jump.
-
-        From the single elements upward, level by level, what is needed for the roots. A node that only one other refers to is
-        not looked at by itself: the long chains of a loop count once.
-        """
-        left, right, level = (np.array(x) for x in (self.left, self.right, self.level))
-        needed = np.zeros(len(left), bool)
-        needed[roots] = True
-        by_level = np.argsort(level, kind="stable")
-        ends = np.searchsorted(level[by_level], np.arange(level[roots].max(initial=0) + 2))
-        for low, high in zip(ends[-2:0:-1], ends[:1:-1], strict=True):
-            nodes = by_level[low:high]
-            nodes = nodes[needed[nodes]]
-            needed[left[nodes]] = needed[right[nodes]] = True
-        needed[0] = False
-        inner, single = np.flatnonzero(needed & (level > 0)), np.flatnonzero(needed & (level == 0))
-
-        jumped = np.zeros(len(left), bool)
-        jumped[inner] = left[inner] == 0
-        parents = np.bincount(left[inner], minlength=len(left)) + np.bincount(right[inner], minlength=len(left))
-        kept = needed & ((level == 0) | (parents != 1) | jumped)
-        kept[roots] = kept[right[jumped]] = True
-        owner = np.arange(len(left))
-        for child in (left[inner], right[inner]):
-            alone = ~kept[child] & (child > 0)
-            owner[child[alone]] = inner[alone]
-        while (owner[owner] != owner).any():
-            owner = owner[owner]
-        of, child = np.tile(owner[inner], 2), np.concatenate([left[inner], right[inner]])
-        edge = kept[child] & (child > 0)
-        order = np.argsort(level[of[edge]], kind="stable")
-        of, child = of[edge][order], child[edge][order]
-
-        first, length = np.zeros(len(left), np.int64), np.zeros(len(left), np.int64)
-        first[single], length[single] = np.arange(len(single)), 1
-        columns, used = 2 * single, len(single)
-        for edges in np.split(np.arange(len(of)), np.flatnonzero(np.diff(level[of])) + 1):
-            which, entries = ragged(first[child[edges]], length[child[edges]])
-            nodes, found = of[edges][which], columns[entries]
-            through = jumped[nodes]
-            nodes, found = np.append(nodes, nodes[through]), np.append(found, found[through] | 1)
-            nodes, found = np.divmod(np.unique(nodes * (2 * len(left)) + found), 2 * len(left))
-            if used + len(found) > len(columns):
-                columns = np.append(columns, np.zeros(used + len(found), np.int64))
-            columns[used : used + len(found)] = found
-            begins = np.flatnonzero(np.diff(nodes, prepend=-1))
-            first[nodes[begins]] = used + begins
-            length[nodes[begins]] = np.diff(begins, append=len(nodes))
-            used += len(found)
-        return first, length, columns
+        if not jumps.any():
+            return _matrix(rows, columns // 2, shape), csr_array(shape, dtype=bool)
+        return _matrix(rows[~jumps], columns[~jumps] // 2, shape), _matrix(rows[jumps], columns[jumps] // 2, shape)
 
     # The table
 
@@ -250,12 +203,6 @@ class Sets:
     def _append(self, *columns: np.ndarray) -> None:
         for stored, column in zip((self.left, self.right, self.level), columns, strict=True):
             stored.frombytes(column.astype(np.int64).tobytes())
-
-
-def ragged(first: np.ndarray, length: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The places first, first + 1, …, as many as `length`, of one entry after the other, and which entry each belongs to."""
-    which = np.repeat(np.arange(len(length)), length)
-    return which, np.arange(len(which)) + np.repeat(first - np.cumsum(length) + length, length)
 
 
 def _matrix(rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int]) -> csr_array:
