@@ -58,13 +58,11 @@ def food_web(n: int = 4) -> Scene[SemiExplicitDAE]:
 
     with no flow over the edges. The reference eliminates z by Newton's method, on coarse grids; it is NaN on others.
 
-    Source: A. C. Hindmarsh et al., *Example Programs for IDA*, problem "idaFoodWeb", after P. N. Brown, *SIAM J. Numer. Anal.*
-    23 (1986), with one species of each.
+    Source: A. C. Hindmarsh et al., *Example Programs for IDA*, problem "idaFoodWeb", after P. N. Brown, A. C. Hindmarsh, *Journal of
+    Applied Mathematics and Computation* 31 (1989), 40, with one species of each.
     """
-    side = np.linspace(0, 1, n)
-    growth = 1 + ALPHA * np.multiply.outer(side, side)
-    growth += BETA * np.multiply.outer(np.sin(4 * np.pi * side), np.sin(4 * np.pi * side))
-    balance = functools.partial(predators, growth=growth.ravel(), laplacian=neumann_laplacian(n))
+    side, b = np.linspace(0, 1, n), growth(n)
+    balance = functools.partial(predators, growth=b.ravel(), laplacian=neumann_laplacian(n))
 
     def diffusion(c: Array) -> Array:
         around = jnp.pad(c, 1, mode="reflect")
@@ -72,13 +70,13 @@ def food_web(n: int = 4) -> Scene[SemiExplicitDAE]:
         return (neighbours - 4 * c) * (n - 1) ** 2
 
     def f(t: Time, x: Array, z: Array, args: Args):
-        return SPREADS[0] * diffusion(x) + x * (growth - x - EATEN * z)
+        return SPREADS[0] * diffusion(x) + x * (b - x - EATEN * z)
 
     def g(t: Time, x: Array, z: Array, args: Args):
-        return SPREADS[1] * diffusion(z) + z * (-growth + FED * x - z)
+        return SPREADS[1] * diffusion(z) + z * (-b + FED * x - z)
 
     def field(t: float, x: np.ndarray) -> np.ndarray:
-        return SPREADS[0] * (neumann_laplacian(n) @ x) + x * (growth.ravel() - x - EATEN * balance(x))
+        return SPREADS[0] * (neumann_laplacian(n) @ x) + x * (b.ravel() - x - EATEN * balance(x))
 
     prey = 10 + (16 * np.multiply.outer(side * (1 - side), side * (1 - side))) ** 2
     embed = lambda t, x: (x.reshape(n, n), balance(x).reshape(n, n))
@@ -86,6 +84,13 @@ def food_web(n: int = 4) -> Scene[SemiExplicitDAE]:
     unknown = lambda times: tuple(np.full((len(times), n, n), np.nan) for _ in range(2))
     reference = minimal(field, prey.ravel(), embed, "LSODA", max_step=np.inf) if n <= KNOWN else unknown
     return Scene(f"food-web-{n}", SemiExplicitDAE(f, g), start, 1.0, reference, index=1, stiff=True, first=1e-5)
+
+
+def growth(n: int) -> np.ndarray:
+    """b of `food_web`."""
+    side = np.linspace(0, 1, n)
+    wave = np.sin(4 * np.pi * side)
+    return 1 + ALPHA * np.multiply.outer(side, side) + BETA * np.multiply.outer(wave, wave)
 
 
 @functools.cache
