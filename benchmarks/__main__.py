@@ -7,11 +7,19 @@ from pathlib import Path
 
 from dae_jax.app.options import writable
 
-from . import chain, cost, jit, stiff, sweep, timing, work_precision
+from . import chain, cost, jit, large, stiff, sweep, timing, work_precision
 from .peers import NAMES, PACKAGES, load
 
 
-PARTS = {"work-precision": work_precision, "chain": chain, "cost": cost, "sweep": sweep, "stiff": stiff, "jit": jit}
+PARTS = {
+    "work-precision": work_precision,
+    "chain": chain,
+    "cost": cost,
+    "sweep": sweep,
+    "stiff": stiff,
+    "jit": jit,
+    "large": large,
+}
 QUICK = ("dae_jax_peer", "c_limit", "plain_diffrax")
 
 

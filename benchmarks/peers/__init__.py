@@ -9,6 +9,7 @@ A peer is a module with
     chain(n, rtol, t1=1.0, method)           → (end state, solve)       where it takes part in the chain
     sweep(angles, rtol, t1=10.0, method)     → (end states, solve)      where it takes part in the sweep
     stiff(problem, rtol, method)             → (end state, solve)       where it has `stiff_methods`, see `stiff_problems`
+    large(problem, rtol, method)             → (states, steps, solve)       where it has `large_methods`, see `large_problems`
 The call builds and solves once; `solve()` then integrates again from the start, warm, and returns when it is done.
 The absolute tolerance equals the relative one throughout. States are as in `problems`.
 """

@@ -6,7 +6,7 @@ and compiled expressions change little. IDAS: BDF, Newton with exact Jacobians, 
 
 import numpy as np
 
-from . import missing, problems
+from . import large_problems, missing, problems
 
 
 name = "CasADi"
@@ -127,3 +127,69 @@ def robertson_variations(rates, rtol):
         return np.array([float(integrator(**start, p=rate)["zf"]) for rate in rates])
 
     return solve(), solve
+
+
+large_methods = ("IDAS",)
+
+
+def large(problem, rtol, method):
+    integrator = _large_integrator(problem, rtol, problem.times.tolist())
+    start = {"x0": problem.x0, "z0": problem.z0} | ({} if problem.p is None else {"p": problem.p})
+
+    def solve():
+        found = integrator(**start)
+        return problem.in_order(np.asarray(found["xf"]).T, np.asarray(found["zf"]).T)
+
+    return solve(), integrator.stats()["nsteps"], solve
+
+
+def large_gradient(problem, rtol, method):
+    """As that of `dae_jax_peer`, but of the mean over all times, by the adjoint equations: where these jump, at each of many
+    times, IDAS does not get on.
+    """
+    import casadi
+
+    integrator = _large_integrator(problem, rtol, [problem.scene.t1], calc_icB=True)
+    p = casadi.MX.sym("p", problem.p.size)
+    mean = integrator(x0=problem.x0, z0=problem.z0, p=p)["qf"] / (problem.scene.t1 - problem.t0)
+    gradient = casadi.Function("gradient", [p], [casadi.gradient(mean, p)])
+    solve = lambda: np.asarray(gradient(problem.p)).ravel()
+    return solve(), None, solve
+
+
+def large_slope(problem, rtol, method):
+    """The gradient of `dae_jax_peer` times p: by a central difference."""
+    integrator = _large_integrator(problem, rtol, large_problems.samples(problem).tolist())
+
+    def deviation(scale):
+        speeds = np.asarray(integrator(x0=problem.x0, z0=problem.z0, p=scale * problem.p)["xf"])[problem.x0.size // 2 :]
+        return np.mean(speeds**2)
+
+    solve = lambda: [(deviation(1.001) - deviation(0.999)) / 0.002]
+    return solve(), None, solve
+
+
+def _large_integrator(problem, rtol, times, **options):
+    """MX expressions, whose Jacobian is sparse and exact. Where it falls apart into small blocks "csparse" factors it fastest,
+    else "qr".
+    """
+    import casadi
+
+    x, z = casadi.MX.sym("x", problem.x0.size), casadi.MX.sym("z", problem.z0.size)
+    p = None if problem.p is None else casadi.MX.sym("p", problem.p.size)
+    ode, alg = (f(problem.t0, x, z, p, large_problems.CasADi) for f in (problem.ode, problem.algebraic))
+    equations = {"x": x, "z": z, "ode": ode, "alg": alg}
+    if p is not None:
+        speeds = x[problem.x0.size // 2 :]
+        equations |= {"p": p, "quad": casadi.sumsqr(speeds) / speeds.numel()}
+    options |= {
+        "reltol": rtol,
+        "abstol": problem.scene.scale * rtol,
+        "max_num_steps": 1_000_000,
+        "calc_ic": False,
+        "init_xdot": problem.dx0.tolist(),
+        "linear_solver": "csparse" if problem.name == "robertson" else "qr",
+        # Of index 2 are only the pressures.
+        "suppress_algebraic": problem.name == "stokes",
+    }
+    return casadi.integrator("large", "idas", equations, problem.t0, times, options)

@@ -5,7 +5,7 @@ import os
 
 import numpy as np
 
-from . import missing, problems
+from . import large_problems, missing, problems
 
 
 name = "dae_jax"
@@ -175,3 +175,76 @@ def robertson_variations(rates, rtol):
 
     solve = lambda: np.asarray(dae_jax.sweep(end, jnp.asarray(rates), progress=False))
     return solve(), solve
+
+
+large_methods = ("RadauIIA5", "BDF")
+
+
+def large(problem, rtol, method):
+    import jax
+    import jax.numpy as jnp
+
+    def end(start, args, rtol):
+        sol = _large(problem, start, args, rtol, method, problem.times)
+        states = [x.reshape(len(x), -1) for x in jax.tree.leaves(sol.ys)]
+        return jnp.concatenate(states, 1), sol.stats["num_steps"], sol.result
+
+    return _large_calls(jax.jit(end), problem, rtol)
+
+
+def large_gradient(problem, rtol, method):
+    """By p, of the mean of ω² at SAMPLES times: how far the frequency deviates."""
+    import jax
+    import jax.numpy as jnp
+
+    times = large_problems.samples(problem)
+
+    def deviation(args, start, rtol):
+        sol = _large(problem, start, args, rtol, method, times)
+        return jnp.mean(sol.ys[0][:, 1] ** 2), (sol.stats["num_steps"], sol.result)
+
+    def gradient(start, args, rtol):
+        found, (steps, result) = jax.grad(deviation, has_aux=True)(args, start, rtol)
+        return found, steps, result
+
+    return _large_calls(jax.jit(gradient), problem, rtol)
+
+
+def large_analyse(problem, rtol, method):
+    """The index, for states."""
+    import jax
+
+    import dae_jax
+
+    jax.config.update("jax_enable_x64", True)
+    scene = problem.scene
+    solve = lambda: dae_jax.analyse(scene.system, problem.t0, scene.y0, scene.args)
+    return [solve().index], None, solve
+
+
+def _large(problem, start, args, rtol, method, times):
+    import diffrax
+
+    import dae_jax
+
+    scene = problem.scene
+    return dae_jax.daesolve(
+        scene.system, getattr(dae_jax, method)(), problem.t0, scene.t1, None, start, args, max_steps=1_000_000, throw=False,
+        stepsize_controller=diffrax.PIDController(rtol=rtol, atol=scene.scale * rtol), saveat=diffrax.SaveAt(ts=times),
+    )  # fmt: skip
+
+
+def _large_calls(function, problem, rtol):
+    """(states, steps, solve) of a jitted function of (start, parameters, tolerance) that gives (states, steps, result)."""
+    import jax
+    import jax.numpy as jnp
+
+    import dae_jax
+
+    jax.config.update("jax_enable_x64", True)
+    values = jax.tree.map(jnp.asarray, (problem.start, problem.scene.args, rtol))
+    solve = lambda: jax.block_until_ready(function(*values))
+    end, steps, result = solve()
+    if result != dae_jax.RESULTS.successful:
+        raise RuntimeError("the solve failed")
+    return np.asarray(end), int(steps), solve

@@ -5,6 +5,7 @@ eliminated by hand.
 """
 
 import functools
+import types
 
 import numpy as np
 
@@ -50,6 +51,43 @@ def stiff(problem, rtol, method):
     if not hasattr(scene.system, "constraint"):
         raise ValueError("the algebraic variables cannot be eliminated by hand")
     return _prepare(_mechanism_field(scene.system), np.concatenate(scene.y0), rtol, problem.t1, method)
+
+
+large_methods = ("Kvaerno5",)
+# Copies; the Jacobian is dense.
+large_limits = {"robertson": 100, "heat": 0, "food web": 0, "stokes": 0, "power grid": 0}
+
+
+def large(problem, rtol, method):
+    """Robertson's reaction, y₃ eliminated."""
+    import diffrax
+    import jax
+    import jax.numpy as jnp
+
+    jax.config.update("jax_enable_x64", True)
+    others = lambda x: 1 - x[: problem.n] - x[problem.n :]
+    field = lambda t, x, args: problem.ode(t, x, others(x), None, jnp_operations())
+
+    @jax.jit
+    def end(start, rtol):
+        return diffrax.diffeqsolve(
+            diffrax.ODETerm(field), getattr(diffrax, method)(), 0.0, problem.scene.t1, None, start, max_steps=100_000,
+            stepsize_controller=diffrax.PIDController(rtol=rtol, atol=problem.scene.scale * rtol),
+            saveat=diffrax.SaveAt(ts=problem.times),
+        )  # fmt: skip
+
+    values = jnp.asarray(problem.x0), jnp.asarray(rtol)
+    solve = lambda: jax.block_until_ready(end(*values))
+    sol = solve()
+    x = np.asarray(sol.ys)
+    return problem.in_order(x, others(x.T).T), int(sol.stats["num_steps"]), solve
+
+
+def jnp_operations():
+    """As `large_problems.Numpy`, of what this problem needs."""
+    import jax.numpy as jnp
+
+    return types.SimpleNamespace(join=jnp.concatenate)
 
 
 def _mechanism_field(system):

@@ -5,7 +5,7 @@ For the chain, unknowns ordered link by link so that the banded solver serves, w
 
 import numpy as np
 
-from . import apart, missing, problems, residuals, stiff_problems
+from . import apart, large_problems, missing, problems, residuals, stiff_problems
 
 
 name = "IDA (scikit-sundae)"
@@ -111,3 +111,66 @@ def stiff_here(problem, rtol, method):
         return solution.y[-1][: problem.size]
 
     return solve(), solve
+
+
+large_methods = ("BDF",)
+# Fewer unknowns are faster dense.
+DENSE = 50
+
+
+def large(problem, rtol, method):
+    """The residual by numpy, the exact Jacobian by CasADi, factored by SuperLU."""
+    from sksundae.ida import IDA
+
+    k, size = problem.x0.size, problem.unknowns
+
+    def residual(t, y, dy, out):
+        out[:k] = dy[:k] - problem.ode(t, y[:k], y[k:], problem.p, large_problems.Numpy)
+        out[k:] = -problem.algebraic(t, y[:k], y[k:], problem.p, large_problems.Numpy)
+
+    atol = np.full(size, problem.scene.scale * rtol)
+    if problem.name == "stokes":
+        atol[k:] = 1e10  # of index 2: no error test
+    jacobian, sparsity = _large_jacobian(problem)
+    integrator = IDA(
+        residual, rtol=rtol, atol=atol, algebraic_idx=np.arange(k, size), max_num_steps=1_000_000, jacfn=jacobian,
+        linsolver="dense" if size < DENSE else "sparse", sparsity=sparsity,
+    )  # fmt: skip
+    start, slope = np.concatenate([problem.x0, problem.z0]), np.concatenate([problem.dx0, np.zeros(size - k)])
+    times = np.append(problem.t0, problem.times)
+
+    def solve():
+        solution = integrator.solve(times, start, slope)
+        if not solution.success:
+            raise RuntimeError(f"IDA: {solution.message}")
+        return problem.in_order(solution.y[1:, :k], solution.y[1:, k:])
+
+    return solve(), None, solve
+
+
+def _large_jacobian(problem):
+    """∂F/∂y + c ∂F/∂ẏ of F = (ẋ − f, −g): its nonzeros column by column, or all of it, and where they are."""
+    import casadi
+    from scipy import sparse
+
+    k, size = problem.x0.size, problem.unknowns
+    y, c = casadi.MX.sym("y", size), casadi.MX.sym("c")
+    right = (f(problem.t0, y[:k], y[k:], problem.p, large_problems.CasADi) for f in (problem.ode, problem.algebraic))
+    differential = casadi.DM(sparse.diags_array(np.repeat([1.0, 0.0], [k, size - k]), format="csc"))
+    jacobian = casadi.Function("jacobian", [y, c], [c * differential - casadi.jacobian(casadi.vertcat(*right), y)])
+    columns, rows = (np.array(x, np.int32) for x in jacobian.sparsity_out(0).get_ccs())
+    pattern = sparse.csc_array((np.ones(rows.size), rows, columns), (size, size))
+    buffer, evaluate = jacobian.buffer()
+    state, scale, values = np.empty(size), np.empty(1), np.empty(rows.size)
+    for i, argument in enumerate((state, scale)):
+        buffer.set_arg(i, memoryview(argument))
+    buffer.set_res(0, memoryview(values))
+    column = np.repeat(np.arange(size), np.diff(columns))
+
+    def fill(t, y, dy, out, cj, matrix):
+        state[:], scale[0] = y, cj
+        evaluate()
+        matrix[(rows, column) if size < DENSE else ...] = values
+
+    fill.buffer = buffer  # which `evaluate` alone does not keep
+    return fill, pattern

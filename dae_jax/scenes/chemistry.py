@@ -1,4 +1,6 @@
-"""Stiff reactions with conservation laws: Robertson's, and the Akzo Nobel problem; both of index 1."""
+"""Stiff reactions with conservation laws: Robertson's, many of them, and the Akzo Nobel problem; all of index 1."""
+
+import functools
 
 import jax.numpy as jnp
 import numpy as np
@@ -6,7 +8,7 @@ from jaxtyping import Array
 
 from ..systems import ImplicitDAE, SemiExplicitDAE
 from ..types import Args, Time
-from .scene import Scene, published
+from .scene import Scene, minimal, published
 
 
 def robertson() -> Scene[SemiExplicitDAE]:
@@ -25,6 +27,49 @@ def robertson() -> Scene[SemiExplicitDAE]:
     end = (np.array([0.2083340149701255e-7, 0.8333360770334713e-13]), np.array([0.9999999791665050]))
     start = (np.array([1.0, 0.0]), np.array([0.0]))
     return Scene("robertson", system, start, 1e11, published(1e11, end), index=1, scale=1e-6, stiff=True, first=1e-6)
+
+
+def robertson_copies(n: int = 4, spread: float = 0.0) -> Scene[SemiExplicitDAE]:
+    """n copies of Robertson's reaction side by side, 3 n unknowns; x = (y₁, y₂) of shape (2, n), z = y₃ of shape (n,).
+
+    `args` are the three rates of each, (3, n), spread by factors e^(spread · N(0, 1)). The reference eliminates y₃; where
+    rates differ it is known of the first copies only, all else is NaN.
+
+    Source: as of `robertson`, which goes on to t = 10¹¹; the end 4 · 10¹⁰ is that of SUNDIALS' idaRoberts.
+    """
+    random = np.random.default_rng(0).standard_normal((3, n))
+    rates = np.array([0.04, 1e4, 3e7])[:, None] * np.exp(spread * random)
+
+    def f(t: Time, x: Array, z: Array, args: Args):
+        forth, back, twice = args[0] * x[0], args[1] * x[1] * z, args[2] * x[1] ** 2
+        return jnp.stack([back - forth, forth - back - twice])
+
+    known = min(n, 4) if spread else 1
+    of_copy = [_one_robertson(tuple(k)) for k in rates.T[:known].tolist()]
+
+    def reference(times: np.ndarray):
+        found = np.stack([copy(times) for copy in of_copy], -1)
+        if spread:
+            found = np.pad(found, ((0, 0), (0, 0), (0, n - known)), constant_values=np.nan)
+        y = np.broadcast_to(found, (*found.shape[:2], n))
+        return y[:, :2], y[:, 2]
+
+    system = SemiExplicitDAE(f, lambda t, x, z, args: x[0] + x[1] + z - 1)
+    start = np.array([np.ones(n), np.zeros(n)]), np.zeros(n)
+    return Scene(
+        f"robertson-{n}", system, start, 4e10, reference, args=rates, index=1, scale=1e-4, stiff=True, first=1e-6
+    )
+
+
+@functools.cache
+def _one_robertson(rates: tuple[float, float, float]):
+    k1, k2, k3 = rates
+
+    def field(t: float, y: np.ndarray) -> np.ndarray:
+        flow = k1 * y[0] - k2 * y[1] * (1 - y[0] - y[1])
+        return np.array([-flow, flow - k3 * y[1] ** 2])
+
+    return minimal(field, [1.0, 0.0], lambda t, y: np.array([*y, 1 - y[0] - y[1]]), "LSODA", max_step=np.inf)
 
 
 def akzo_nobel() -> Scene[ImplicitDAE]:

@@ -7,7 +7,7 @@ from typing import Any, Generic, TypeVar
 
 import jax
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import ArrayLike, PyTree
 
 from ..systems import AbstractSystem
 
@@ -102,24 +102,40 @@ def published(t1: float, end: PyTree[np.ndarray]) -> Callable[[np.ndarray], Any]
 
 
 def minimal(
-    field: Callable[[float, np.ndarray], np.ndarray], z0: list[float], embed: Callable[[float, np.ndarray], State]
-) -> Callable[[np.ndarray], State]:
-    """A reference from ż = field(t, z) in minimal coordinates, by scipy's DOP853 at rtol 1e-13; `embed(t, z)` is (q, v)
-    for one time and state.
+    field: Callable[[float, np.ndarray], np.ndarray],
+    z0: ArrayLike,
+    embed: Callable[[float, np.ndarray], Any],
+    method: str = "DOP853",
+    kinks: tuple[float, ...] = (),
+    max_step: float = 0.05,
+) -> Callable[[np.ndarray], Any]:
+    """A reference from ż = field(t, z) in minimal coordinates, by a method of scipy at rtol 1e-13, begun anew at `kinks`;
+    `embed(t, z)` is the state for one time and z: one array or a tuple of arrays.
     """
 
     @functools.lru_cache(maxsize=4)
-    def solved(moments: bytes) -> State:
+    def solved(moments: bytes) -> Any:
         from scipy.integrate import solve_ivp
 
         times = np.frombuffer(moments)
         points = np.unique(np.concatenate([[0.0], times]))
-        found = solve_ivp(field, (0.0, points[-1] or 1.0), z0, "DOP853", points, rtol=1e-13, atol=1e-14, max_step=0.05)
-        rows = [embed(t, z) for t, z in zip(points, found.y.T, strict=True)]
+        rows, begin, z = [embed(0.0, np.asarray(z0, float))], 0.0, z0
+        for end in [*(kink for kink in kinks if kink < points[-1]), points[-1] or 1.0]:
+            # A jump at a kink belongs to what comes after it.
+            stop = np.nextafter(end, 0) if end in kinks else end
+            wanted = np.minimum(points[(points > begin) & (points <= end)], stop)
+            found = solve_ivp(
+                field, (begin, stop), z, method, np.union1d(wanted, [stop]), rtol=1e-13, atol=1e-14, max_step=max_step
+            )
+            rows += [embed(t, y) for t, y in zip(found.t[: len(wanted)], found.y.T, strict=False)]
+            begin, z = end, found.y[:, -1]
         at = np.searchsorted(points, times)
-        q, v = (np.stack(x)[at] for x in zip(*rows, strict=True))
-        for shared in (q, v):
-            shared.setflags(write=False)
-        return q, v
+        return jax.tree.map(lambda *x: _shared(np.stack(x)[at]), *rows)
 
     return lambda times: solved(np.atleast_1d(np.asarray(times, float)).tobytes())
+
+
+def _shared(values: np.ndarray) -> np.ndarray:
+    """What is cached is not to be written to."""
+    values.setflags(write=False)
+    return values
