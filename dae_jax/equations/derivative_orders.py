@@ -104,7 +104,7 @@ class Offsets:
         of_f = self.variables
         if not self.combination.rows:
             return of_f
-        terms = [(i, j) for i in range(of_f.shape[0]) for j, *_ in self.combination.terms(i)]
+        terms = [(i, j) for i in range(len(self.signature)) for j, *_ in self.combination.terms(i)]
         rows, columns = np.array(terms).T
         return csr_array((np.ones(len(terms), bool), (rows, columns)), shape=of_f.shape) @ of_f
 

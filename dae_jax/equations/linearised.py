@@ -19,6 +19,7 @@ from ..structure import (
     column_colouring,
     highest_value_transversal,
     reverse_cuthill_mckee,
+    shape_of,
     sigma_method,
     signature,
 )
@@ -250,7 +251,7 @@ class _Pattern(NamedTuple):
     def of(cls, pattern: "Bool[np.ndarray, 'n n'] | csr_array") -> "_Pattern":
         rows = csr_array(pattern)
         rows.sort_indices()
-        return cls(rows.shape[0], rows.indices.astype(np.int64).tobytes(), rows.indptr.astype(np.int64).tobytes())
+        return cls(shape_of(rows)[0], rows.indices.astype(np.int64).tobytes(), rows.indptr.astype(np.int64).tobytes())
 
     def whole(self) -> csr_array:
         """As a matrix of truth values."""
@@ -284,7 +285,7 @@ def _outline(
 
 def _storage(pattern: csr_array, by_rate: csr_array, transversal: list[int]) -> Storage:
     """A band, with each equation in the place of its variable, or sparse factors, where that is cheaper."""
-    n = pattern.shape[0]
+    n = len(transversal)
     if n <= LOOPED:
         return Dense(n)
     pairing = np.array(transversal)
@@ -311,5 +312,5 @@ def _compression(pattern: csr_array, storage: Storage) -> Compression:
 
 def _is_in(pattern: csr_array, rows: Int[np.ndarray, "*stored"], columns: Int[np.ndarray, "*stored"]) -> Any:
     """Which of the positions a pattern has."""
-    n, (i, j) = pattern.shape[1], pattern.nonzero()
+    n, (i, j) = shape_of(pattern)[1], pattern.nonzero()
     return np.isin(rows.astype(np.int64) * n + columns, i.astype(np.int64) * n + j)

@@ -87,7 +87,7 @@ def _factors(pattern: PivotedLU, entries: bytes, dtype: str) -> _Factors:
     from scipy.sparse.linalg import splu
 
     a, n = np.frombuffer(entries, dtype), pattern.size
-    largest = np.zeros(n, a.real.dtype)
+    largest = np.zeros(n, np.finfo(dtype).dtype)
     if not np.isfinite(a).all():
         return _Factors(None, largest)
     np.maximum.at(largest, pattern.rows, np.abs(a))

@@ -1,6 +1,7 @@
 """Whether a sparse matrix is nonsingular to round-off."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array
@@ -73,11 +74,11 @@ class _Inverse(LinearOperator):
         return _Inverse(self.factors, not self.transposed)
 
 
-def has_all_pivots(matrix: csr_array) -> bool:
+def has_all_pivots(matrix: Any) -> bool:
     """Whether elimination with partial pivoting finds a pivot beyond round-off in every row, which are scaled to a greatest entry
     of 1.
     """
-    rows = np.abs(matrix).max(1).toarray().reshape(-1)
+    rows = abs(matrix).max(1).toarray().reshape(-1)
     if not rows.all():
         return False
     try:

@@ -172,6 +172,6 @@ class Sparse:
 
 def _compiled(a: Inexact[Array, " entries"], symbolic: SymbolicLU) -> bool:
     """Whether our compiler makes the loops: entry by entry in XLA they would take a thousand times as long."""
-    like = lambda x: jax.ShapeDtypeStruct(x.shape, jnp.int32)
+    like: Any = lambda x: jax.ShapeDtypeStruct(x.shape, jnp.int32)
     indices = Indices(*(like(getattr(symbolic, name)) for name in Indices._fields))
     return compiles(eliminated, jax.ShapeDtypeStruct(a.shape, a.dtype), indices)

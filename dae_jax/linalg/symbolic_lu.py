@@ -69,7 +69,7 @@ def symbolic_lu(
     both.data[:] = 1
     m_matrix = csc_array(diags_array((1 + DOMINANCE) * np.maximum(both.sum(1), 1)) - both)
     factors = splu(m_matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    filled = csr_array(factors.L != 0) + csr_array(factors.U != 0)
+    filled = csr_array(csr_array(factors.L != 0) + csr_array(factors.U != 0))
     filled.sort_indices()
     position = factors.perm_c
     if not np.array_equal(position, factors.perm_r):

@@ -69,19 +69,18 @@ def operators(n: int) -> Any:
     """
     from scipy import sparse
 
-    one, fewer = np.ones(n - 1), sparse.eye_array(n - 1)
     # Of one line: from its inner faces to its cells; the second derivative on faces, and in cells between walls.
-    spread = sparse.diags_array([one, -one], offsets=[0, -1], shape=(n, n - 1)) * n
+    spread = (np.eye(n, n - 1) - np.eye(n, n - 1, -1)) * n
     faces = -spread.T @ spread
-    cells = sparse.diags_array([one, np.array([-3.0, *[-2.0] * (n - 2), -3.0]), one], offsets=[-1, 0, 1]) * n**2
-    cell = sparse.eye_array(n)
+    cells = (np.eye(n, k=1) + np.eye(n, k=-1) - np.diag([3.0, *[2.0] * (n - 2), 3.0])) * n**2
+    cell, fewer = np.eye(n), np.eye(n - 1)
     along_x = sparse.kron(faces, cell) + sparse.kron(fewer, cells)
     along_y = sparse.kron(cells, fewer) + sparse.kron(cell, faces)
-    divergence = sparse.hstack([sparse.kron(spread, cell), sparse.kron(cell, spread)], "csr")
+    divergence = sparse.csr_array(sparse.hstack([sparse.kron(spread, cell), sparse.kron(cell, spread)]))
     lid = np.zeros((n - 1, n))
     lid[:, -1] = 2 * n**2 * _lid(n)
     return SimpleNamespace(
-        laplacian=sparse.block_diag([along_x, along_y], "csr"),
+        laplacian=sparse.csr_array(sparse.block_diag([along_x, along_y])),
         divergence=divergence,
         gradient=sparse.csr_array(-divergence.T),
         lid=np.concatenate([lid.ravel(), np.zeros(n * (n - 1))]),
@@ -94,7 +93,8 @@ def _pressure(of: Any, u: np.ndarray) -> np.ndarray:
 
     poisson = (of.divergence @ of.gradient).tocsc()[:-1, :-1]
     source = VISCOSITY * (of.divergence @ (of.laplacian @ u + of.lid))
-    return np.append(spsolve(poisson, source[:-1]), 0.0)
+    pressure: Any = spsolve(poisson, source[:-1])
+    return np.append(pressure, 0.0)
 
 
 def _reference(n: int):

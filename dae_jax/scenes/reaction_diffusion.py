@@ -98,8 +98,7 @@ def neumann_laplacian(n: int) -> Any:
     """Δ on n × n points of the unit square, row by row, whose values beyond an edge mirror those before it: a sparse matrix."""
     from scipy import sparse
 
-    off = np.ones(n - 1)
-    line = sparse.lil_array(sparse.diags_array([off, np.full(n, -2.0), off], offsets=[-1, 0, 1]))
+    line = np.eye(n, k=1) + np.eye(n, k=-1) - 2 * np.eye(n)
     line[0, 1] = line[-1, -2] = 2.0
     return sparse.csr_array(sparse.kronsum(line, line)) * (n - 1) ** 2
 

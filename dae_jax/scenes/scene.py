@@ -2,12 +2,12 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Generic, TypeVar
 
 import jax
 import numpy as np
-from jaxtyping import ArrayLike, PyTree
+from jaxtyping import PyTree
 
 from ..systems import AbstractSystem
 
@@ -103,7 +103,7 @@ def published(t1: float, end: PyTree[np.ndarray]) -> Callable[[np.ndarray], Any]
 
 def minimal(
     field: Callable[[float, np.ndarray], np.ndarray],
-    z0: ArrayLike,
+    z0: Sequence[float] | np.ndarray,
     embed: Callable[[float, np.ndarray], Any],
     method: str = "DOP853",
     kinks: tuple[float, ...] = (),

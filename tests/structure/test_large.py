@@ -297,7 +297,7 @@ def test_slopes_of_full_equations_are_found_apart():
 
 
 def test_a_full_row_has_a_colour_for_each_column():
-    pattern = scipy.sparse.eye_array(2000, format="lil", dtype=bool)
+    pattern = np.eye(2000, dtype=bool)
     pattern[7] = True
     assert column_colouring(scipy.sparse.csr_array(pattern)).tolist() == list(range(2000))
 
