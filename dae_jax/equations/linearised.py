@@ -293,7 +293,7 @@ def _storage(pattern: csr_array, by_rate: csr_array, transversal: list[int]) -> 
     if n <= LARGE:
         equation_of = np.argsort(pairing)
         paired = pattern[equation_of]
-        order = reverse_cuthill_mckee(paired + paired.T)
+        order = reverse_cuthill_mckee((paired + paired.T).toarray())
         rows, columns = paired[order][:, order].nonzero()
         lower, upper = (max(int((way * (rows - columns)).max(initial=0)), 0) for way in (1, -1))
         if BAND_COST * (lower + 1) * (lower + upper + 1) <= n * n:

@@ -141,7 +141,7 @@ def test_batch_is_one_at_a_time():
         np.testing.assert_allclose(both[1][i], alone[1], rtol=1e-6, atol=1e-10)
 
 
-def test_a_thousand_unknowns_in_banded_storage():
+def test_eight_hundred_unknowns():
     """Heat with a flux that is a variable of its own at each point: 2 × 400 unknowns, index 1."""
     n = 400
     dx = np.pi / n
