@@ -214,7 +214,8 @@ def test_residuals_are_one_kernel(name):
 
 
 @pytest.mark.parametrize(
-    ("n", "storage"), [(200, "a band of 1 diagonals below and 1 above"), (300, "sparse, 300 unknowns, 898 entries, 898 in the")]
+    ("n", "storage"),
+    [(200, "a band of 1 diagonals below and 1 above"), (300, "sparse, 300 unknowns, 898 entries, 898 in the")],
 )
 def test_a_large_residual_has_a_band_or_sparse_factors_and_few_directional_derivatives(n, storage):
     def diffusion(t, y, yd, args):
