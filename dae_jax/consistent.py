@@ -204,7 +204,7 @@ def consistent_state(
     - `yd0`: near which ẏ is looked for, for an `ImplicitDAE` that is nonlinear in it.
 
     Errors: `ValueError` where no such state is found from here, naming the equations that remain off; NaN where the
-    arguments are traced.
+    arguments are traced; `NotImplementedError` for its derivative where it has more than 256 unknowns and hidden equations.
     """
     refuse_wrong_state(system, y0)
     system = current(with_rates(system, yd0, y0))

@@ -124,7 +124,8 @@ class DAESolution(eqx.Module):
     - `t0`, `t1`: the interval.
     - `ts`: the saved times; `ys`: the saved states, with the structure of `y0` (or of what `SaveAt(fn=...)` returns).
     - `interpolation`: with `SaveAt(dense=True)`, the solution at any time; `sol.evaluate(t)` for short.
-    - `stats`: counts of steps; `stats["end_time"]`: the time at which the solve ended; of a solve outside `jit`, `vmap` and
+    - `stats`: counts of steps, of Radau and BDF also "num_jacobians", "num_factorisations" and "num_corrections" (of Newton's method)
+      in the accepted ones; `stats["end_time"]`: the time at which the solve ended; of a solve outside `jit`, `vmap` and
       `grad` also "compile_seconds", the time that it took to trace and compile it and to run it for the first time, 0 where it
       was compiled already; `stats["doubts"]`: 0, or what an `AccuracyWarning` says, as the sum of 1 (drifted), 2 (fixed steps too
       large), 4 (very many steps) and 8 (a singular configuration was passed).

@@ -71,7 +71,8 @@ def daesolve(
     - `t0`, `t1`, `dt0`: start, end and first (or fixed) step; t1 < t0 integrates backwards, with dt0 < 0.
     - `y0`: the state at `t0`: (q, v), (x, z) or y, as the system has it; must satisfy the equations, also the hidden ones.
     - `args`: handed to the system's functions.
-    - `yd0`: ẏ at the start, or near it, in the structure of `y0`: for an `ImplicitDAE` that is nonlinear in ẏ.
+    - `yd0`: ẏ at the start, or near it, in the structure of `y0`: for an `ImplicitDAE` that is nonlinear in ẏ. With more than 256
+      unknowns ẏ is looked for from there only, and that several ẏ satisfy the equations is not seen.
     - `formulation`: which equations are integrated; by default `Differentiation()`, the underlying ODE; for solvers of
       0 = F(t, y, ẏ) such as `RadauIIA5`, `Residual()`, or `DummyDerivatives()` where these need not converge for the
       equations as they are written (an index that is too high, or a null space of ∂F/∂ẏ that changes).
