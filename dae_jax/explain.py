@@ -257,10 +257,13 @@ def _compiled(solve: Solve, jaxpr: ClosedJaxpr, starts: list[bool]) -> dict[str,
     if not one_kernel_enabled() or jax.default_backend() != "cpu" or solve.derivative() == "any":
         return {"compiler": "xla", "batch_compiler": "xla", "reasons": (off,), "hindrances": ()}
     alone, batch = decision(jaxpr), decision(jaxpr, starts) if any(starts) else Decision("xla", ())
+    reasons: dict[str, str] = {}
+    for found in (*alone.unsupported, *batch.unsupported):
+        reasons.setdefault(found.reason, str(found))
     return {
         "compiler": alone.compiler,
         "batch_compiler": "llvm" if batch.compiler == "llvm" else "xla",
-        "reasons": tuple(dict.fromkeys(map(str, (*alone.unsupported, *batch.unsupported)))),
+        "reasons": tuple(reasons.values()),
         "hindrances": tuple(dict.fromkeys(found.primitive for found in alone.unsupported)),
     }
 

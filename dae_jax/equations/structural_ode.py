@@ -34,7 +34,7 @@ from .initial_rates import is_nonlinear, rates_of
 from .manifold_ode import Feedback, ManifoldODE, at_one_instant
 from .mechanical import MechanicalODE
 from .residual_form import LARGE, ResidualForm
-from .sparse_normals import SparseNormals
+from .sparse_invariants import SparseInvariants
 from .taylor import total_derivatives
 
 
@@ -123,7 +123,7 @@ class StructuralODE(ManifoldODE):
     combination: Combination = eqx.field(static=True)
     orders: Orders = eqx.field(static=True)
     tearing: Tearing = eqx.field(static=True)
-    sparse: SparseNormals | None = eqx.field(static=True, default=None)
+    sparse: SparseInvariants | None = eqx.field(static=True, default=None)
 
     @classmethod
     def of(cls, form: ResidualForm, dtype: DType, complete: bool = False) -> "StructuralODE":
@@ -140,7 +140,7 @@ class StructuralODE(ManifoldODE):
 
         if complete:
             ode = differentiated(1)
-            sparse = SparseNormals.of(ode, found.occurrence) if form.size > LARGE else None
+            sparse = SparseInvariants.of(ode, found.occurrence) if form.size > LARGE else None
             return dataclasses.replace(ode, sparse=sparse)
         ode = differentiated(0)
         linear, known = ode._coefficients(dtype) if max(found.sigma.variable_offsets) else (False, np.zeros(0))

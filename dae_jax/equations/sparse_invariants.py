@@ -1,4 +1,4 @@
-"""Normals to the manifold of a large system: a sparse ∂H/∂Y, and the nearest point on the linearisation of H = 0."""
+"""The invariants of a large system: a sparse ∂H/∂Y, and the nearest point on the linearisation of H = 0."""
 
 import dataclasses
 import functools
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class SparseNormals:
+class SparseInvariants:
     """∂H/∂Y has entries at (`rows`, `columns`), found as directional derivatives along `colours` of the entries of Y, −1 for
     those along none. Compared by identity.
     """
@@ -30,7 +30,7 @@ class SparseNormals:
     count: int
 
     @classmethod
-    def of(cls, ode: "StructuralODE", pattern: Any) -> "SparseNormals":
+    def of(cls, ode: "StructuralODE", pattern: Any) -> "SparseInvariants":
         """`pattern`: the variables of each equation F̄ᵢ, with any of their derivatives, as a sparse matrix.
 
         d^kF̄ᵢ/dt^k has, of each of them, derivatives of orders 0 to k + 1 at most.
