@@ -89,7 +89,8 @@ class Unsolved(eqx.Module):
         """Which equations are off, and by how much."""
         residuals, allowed = np.abs(np.asarray(self.residuals)), np.asarray(self.allowed)
         off = np.flatnonzero(~(residuals <= allowed))
-        by_size = np.argsort(-residuals[off] / np.maximum(allowed[off], np.finfo(allowed.dtype).tiny), kind="stable")
+        sizes = residuals[off] / np.maximum(allowed[off], np.finfo(allowed.dtype).tiny)
+        by_size = np.lexsort((-np.nan_to_num(sizes), ~np.isnan(residuals[off])))
         worst = np.sort(off[by_size[:LISTED]])
         lines = [f"  0 = {self.equations[i]} is off by {float(self.residuals[i]):.6g}" for i in worst]
         lines += [f"  and {len(off) - LISTED:,} more"] if len(off) > LISTED else []

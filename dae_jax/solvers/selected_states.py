@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from ..linalg import row_products, solve
 from ..types import BoolLike, Time
 from .chart_steps import AbstractChartSolver
 from .manifold import or_nan, outcome, time_sign
@@ -57,8 +58,11 @@ class SelectedStates(Replayable, AbstractChartSolver):
             stays = jnp.all(before * after > 0)
             y1, error = or_nan(stays, y1), None if error is None else or_nan(stays, error)
             result = diffrax.RESULTS.where(stays, result, outcome(stays))
-            # Entries that are not integrated have no error, and none may be hidden among them.
-            error = None if error is None else error * (y1.size / (y1.size - len(directions))) ** 0.5
+            if error is not None:
+                # Entries that are not integrated are off by what follows from the error of the others.
+                normals = args.normals(sign * t1, y1)
+                follows = solve(row_products(normals, directions), jnp.sum(normals * error, 1))
+                error = error - jnp.sum(directions * follows[:, None], 0)
         return y1, error, dense, Selection(derivative, directions, solver_state.switches + switched), result
 
     def replay(

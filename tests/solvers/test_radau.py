@@ -204,7 +204,7 @@ def test_a_thousand_unknowns():
     system = dae_jax.SemiExplicitDAE(f, g)
     fluxes = -N * np.diff(np.concatenate([[0], modes, [0]]))
     plan = dae_jax.explain(system, dae_jax.RadauIIA5(), 0.0, (modes, fluxes))
-    assert plan.linear_solver.startswith("a band")
+    assert plan.linear_solver.startswith("sparse")
     sol = dae_jax.daesolve(system, dae_jax.RadauIIA5(), 0.0, 0.1, None, (modes, fluxes))
     decay = np.exp(-0.1 * rate)
     np.testing.assert_allclose(sol.ys[0][-1], modes * decay, atol=1e-8)
