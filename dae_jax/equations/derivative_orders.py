@@ -139,11 +139,12 @@ def find_offsets(form: Form, dtype: DType) -> Offsets:
     key = _known_by(form, dtype)
     if key is None:
         return offsets_of(form, dtype)
-    if key not in _found:
-        _found[key] = offsets_of(form, dtype)
+    found = _found.get(key)
+    if found is None:
+        found = _found[key] = offsets_of(form, dtype)
         for oldest in list(_found)[:-KEPT]:
             _found.pop(oldest, None)
-    return _found[key]
+    return found
 
 
 def _known_by(form: Form, dtype: DType) -> Hashable:
