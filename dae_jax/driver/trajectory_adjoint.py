@@ -19,6 +19,7 @@ from jax import lax
 from jaxtyping import Array, Float, PyTree
 
 from .._compat import WrapTerm
+from ..equations.residual_form import LARGE
 from ..solvers import is_recomputable, replays
 from ..types import IntScalar, Scalar, Time, Y
 from .start import is_saved_part
@@ -28,20 +29,24 @@ if TYPE_CHECKING:
     from .program import Solve
 
 
-# Numbers on the tape, at most; beyond that diffrax's checkpoints, which take twice the time and more.
-LARGEST_TAPE = 2**25
+# Numbers on the tape, at most, of points, and of a large system, whose steps take longer than to lay out the tape, in all; beyond
+# that diffrax's checkpoints, which take twice the time and more.
+LARGEST_TAPE, LARGEST_OF_LARGE = 2**20, 2**25
 
 
 def can_be_taped(solve: "Solve", size: int) -> bool:
     """Whether the tape serves a solve with `size` unknowns."""
     saveat, part = solve.saveat, solve.saveat.subs
+    numbers, largest = (solve.max_steps or 0) + 1, LARGEST_TAPE
+    if size > LARGE:
+        numbers, largest = numbers * (1 + getattr(solve.solver, "kept", 0)), LARGEST_OF_LARGE
     return (
         is_saved_part(part)
         and not (part.steps or saveat.dense or saveat.solver_state or saveat.controller_state or saveat.made_jump)
         and solve.event is None
         and type(solve.controller) in (diffrax.PIDController, diffrax.ConstantStepSize)
         and solve.max_steps is not None
-        and (solve.max_steps + 1) * size * (1 + getattr(solve.solver, "kept", 0)) <= LARGEST_TAPE
+        and numbers * size <= largest
         and (is_recomputable(solve.solver) or replays(solve.solver))
     )
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import dae_jax
-from dae_jax.driver.trajectory_adjoint import LARGEST_TAPE, can_be_taped
+from dae_jax.driver.trajectory_adjoint import LARGEST_OF_LARGE, can_be_taped
 from dae_jax.scenes import chain, pendulum
 
 
@@ -68,7 +68,7 @@ def test_is_used_where_it_should_be():
         diffrax.RecursiveCheckpointAdjoint(), None, diffrax.NoProgressMeter(), 1000,
     )  # fmt: skip
     assert can_be_taped(solve, 4)
-    assert not can_be_taped(solve, LARGEST_TAPE // 1000)
+    assert not can_be_taped(solve, LARGEST_OF_LARGE // 1000)
     for name, value in {
         "saveat": diffrax.SaveAt(dense=True),
         "solver": diffrax.Kvaerno5(),
