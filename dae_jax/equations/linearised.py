@@ -23,7 +23,8 @@ from ..structure import (
     sigma_method,
     signature,
 )
-from ..types import DType, Flat, Scalar, Time
+from ..types import Flat, Scalar, Time
+from .compression import Compression
 from .derivative_orders import Combination, Offsets, find_offsets
 from .index1_form import Index1Form
 from .initial_rates import is_nonlinear, rates_of
@@ -38,29 +39,6 @@ GAUSS_NEWTON = 5
 DEAR_CORRECTIONS = 20
 # What a multiplication by a band, and one of sparse factors, costs, in parts of one of a dense matrix.
 BAND_COST, SPARSE_COST = 4, 16
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Compression:
-    """A Jacobian as directional derivatives, one for each colour of its columns, and where its stored entries are among them
-    (−1: 0).
-    """
-
-    colours: Int[np.ndarray, " n"]
-    places: Int[np.ndarray, "*stored"]
-
-    @property
-    def count(self) -> int:
-        """How many colours there are."""
-        return int(self.colours.max(initial=-1)) + 1
-
-    def seeds(self, dtype: DType) -> Float[Array, "colours n"]:
-        """The directions."""
-        return (jnp.asarray(self.colours) == jnp.arange(self.count)[:, None]).astype(dtype)
-
-    def entries(self, compressed: Float[Array, "colours n"]) -> Float[Array, "*stored"]:
-        """The stored entries."""
-        return jnp.where(self.places >= 0, compressed.reshape(-1)[self.places], 0)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -110,7 +88,7 @@ class LinearisedResidual(eqx.Module):
             found = Offsets(full, full, rows, sigma_method(rows))
         indices = indices or found.indices
         offsets = found.sigma.variable_offsets
-        patterns = _Pattern.of(found.by_y), _Pattern.of(found.by_rate)
+        patterns = _PatternKey.of(found.by_y), _PatternKey.of(found.by_rate)
         return cls(form, _outline(*patterns, indices, offsets, found.index > 1, found.combination))
 
     @property
@@ -144,8 +122,7 @@ class LinearisedResidual(eqx.Module):
         if compression is None:
             return jax.jacfwd(self.form.residual, argument)(*point)
         of = lambda x: self.residual(*(x if k == argument else given for k, given in enumerate(point)))
-        along = lambda seed: jax.jvp(of, (point[argument],), (seed,))[1]
-        return compression.entries(jax.vmap(along)(compression.seeds(point[1].dtype)))
+        return compression.jacobian(of, point[argument])
 
     def factor(self, j: Array, m: Array, c: Inexact[Array, ""], h: Time) -> tuple[Any, Float[Array, ""]]:
         """The factors of J + c M, for c of the order of 1/h, and the smallest pivot, of round-off size for a singular one.
@@ -240,7 +217,7 @@ def powers(x: Float[Array, ""], exponents: tuple[int, ...]) -> Float[Array, " n"
     )
 
 
-class _Pattern(NamedTuple):
+class _PatternKey(NamedTuple):
     """Which entries of a square matrix may not be 0: rows of it one after the other, as a key of what was found."""
 
     size: int
@@ -248,7 +225,7 @@ class _Pattern(NamedTuple):
     starts: bytes
 
     @classmethod
-    def of(cls, pattern: "Bool[np.ndarray, 'n n'] | csr_array") -> "_Pattern":
+    def of(cls, pattern: "Bool[np.ndarray, 'n n'] | csr_array") -> "_PatternKey":
         rows = csr_array(pattern)
         rows.sort_indices()
         return cls(shape_of(rows)[0], rows.indices.astype(np.int64).tobytes(), rows.indptr.astype(np.int64).tobytes())
@@ -261,8 +238,8 @@ class _Pattern(NamedTuple):
 
 @functools.lru_cache(maxsize=64)
 def _outline(
-    on_y: _Pattern,
-    on_rate: _Pattern,
+    on_y: _PatternKey,
+    on_rate: _PatternKey,
     indices: tuple[int, ...],
     offsets: tuple[int, ...],
     hidden: bool,

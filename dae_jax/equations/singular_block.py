@@ -1,12 +1,10 @@
 """Which equations do not determine which unknowns, where an iteration matrix is singular."""
 
-from collections.abc import Sequence
-
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..structure import Block, StructurallySingular, block_triangular, require_nonsingular
+from ..structure import Block, StructurallySingular, block_triangular, in_short, require_nonsingular
 from ..systems import System, is_mechanism
 from ..types import Args, State, Time
 from .linearised import LinearisedResidual
@@ -15,8 +13,8 @@ from .residual_form import ResidualForm
 
 # A step that is small beside all that moves; what of a row counts as 0; and a smallest singular value that does.
 STEP, NOTHING, SINGULAR = 1e-6, 1e-12, 1e-10
-# Larger blocks are not looked into; and so many names are written out.
-LARGEST, LISTED = 2000, 6
+# Larger blocks are not looked into.
+LARGEST = 2000
 
 
 def singular_block(system: System, t: Time, state: State, args: Args) -> str:
@@ -38,7 +36,7 @@ def singular_block(system: System, t: Time, state: State, args: Args) -> str:
     if found is None:
         return ""
     equations, variables = (
-        _listed([names[i] for i in chosen])
+        in_short([names[i] for i in chosen])
         for names, chosen in ((form.equations, found.equations), (form.variables, found.variables))
     )
     return f"There the equations {equations} do not determine {variables}."
@@ -66,8 +64,3 @@ def _block(rows: np.ndarray, columns: np.ndarray, entries: Float[np.ndarray, " e
             if sizes[-1] <= SINGULAR * sizes[0]:
                 return block
     return None
-
-
-def _listed(names: Sequence[str]) -> str:
-    more = len(names) - LISTED
-    return ", ".join(names[:LISTED]) + (f" and {more:,} more" if more > 0 else "")

@@ -30,7 +30,7 @@ class PivotedLU:
         it is `needed`.
         """
         real = jnp.finfo(a.dtype).dtype
-        on_host = lambda a, needed: np.asarray(_factors(self, *_key(a)).smallest if needed else 0.0, real)
+        on_host = lambda a, needed: np.asarray(_remembered(self, *_key(a)).smallest if needed else 0.0, real)
         return jax.pure_callback(on_host, jax.ShapeDtypeStruct((), real), a, needed, vmap_method="sequential")
 
     def solve(self, a: Inexact[Array, " entries"], b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
@@ -52,14 +52,16 @@ class PivotedLU:
 
         def on_host(a: Any, b: Any, needed: Any) -> np.ndarray:
             return (
-                _factors(self, *_key(a)).solve(np.asarray(b, dtype), transposed) if needed else np.zeros(b.shape, dtype)
+                _remembered(self, *_key(a)).solve(np.asarray(b, dtype), transposed)
+                if needed
+                else np.zeros(b.shape, dtype)
             )
 
         return jax.pure_callback(on_host, jax.ShapeDtypeStruct(b.shape, dtype), a, b, needed, vmap_method="sequential")
 
 
 @dataclasses.dataclass(frozen=True)
-class _Factors:
+class HostFactors:
     """What SuperLU made of the matrix whose rows were multiplied by `scale`; `None` of a singular one."""
 
     lu: Any
@@ -82,21 +84,57 @@ def _key(a: Any) -> tuple[bytes, str]:
 
 
 @functools.lru_cache(maxsize=KEPT)
-def _factors(pattern: PivotedLU, entries: bytes, dtype: str) -> _Factors:
+def _remembered(pattern: PivotedLU, entries: bytes, dtype: str) -> HostFactors:
+    return factorised(pattern.rows, pattern.columns, np.frombuffer(entries, dtype), pattern.size)
+
+
+def factorised(
+    rows: Int[np.ndarray, " entries"],
+    columns: Int[np.ndarray, " entries"],
+    a: Inexact[np.ndarray, " entries"],
+    n: int,
+) -> HostFactors:
+    """The factors of the n × n matrix with entries `a`."""
     from scipy.sparse import csc_array
     from scipy.sparse.linalg import splu
 
-    a, n = np.frombuffer(entries, dtype), pattern.size
-    largest = np.zeros(n, np.finfo(dtype).dtype)
+    largest = np.zeros(n, np.finfo(a.dtype).dtype)
     if not np.isfinite(a).all():
-        return _Factors(None, largest)
-    np.maximum.at(largest, pattern.rows, np.abs(a))
+        return HostFactors(None, largest)
+    np.maximum.at(largest, rows, np.abs(a))
     if not largest.all():
-        return _Factors(None, largest)
+        return HostFactors(None, largest)
     scale = 1 / largest
     try:
-        lu = splu(csc_array((a * scale[pattern.rows], (pattern.rows, pattern.columns)), shape=(n, n)))
+        lu = splu(csc_array((a * scale[rows], (rows, columns)), shape=(n, n)))
     except RuntimeError:
         # Exactly singular.
         lu = None
-    return _Factors(lu, scale)
+    return HostFactors(lu, scale)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Augmented:
+    """r + B x = b, Bᵀ r − ε x = c, for B with `shape` and entries at (`rows`, `columns`): with c = 0 and ε → 0 the least squares
+    of B x = b, with b = 0 the shortest r with Bᵀ r = c. Compared by identity.
+    """
+
+    rows: Int[np.ndarray, " entries"]
+    columns: Int[np.ndarray, " entries"]
+    shape: tuple[int, int]
+
+    def solve(
+        self, b_entries: Float[Array, " entries"], cut: Float[Array, ""], b: Float[Array, " m"], c: Float[Array, " n"]
+    ) -> tuple[Float[Array, " m"], Float[Array, " n"]]:
+        """r and x."""
+        entries = jnp.concatenate([jnp.ones_like(b), b_entries, b_entries, jnp.full_like(c, -1) * cut])
+        both = self._whole.solve(entries, jnp.concatenate([b, c]))
+        return both[: self.shape[0]], both[self.shape[0] :]
+
+    @functools.cached_property
+    def _whole(self) -> PivotedLU:
+        m, n = self.shape
+        first, second = np.arange(m), m + np.arange(n)
+        rows = np.concatenate([first, self.rows, m + self.columns, second])
+        columns = np.concatenate([first, m + self.columns, self.rows, second])
+        return PivotedLU(rows, columns, m + n)

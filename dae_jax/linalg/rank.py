@@ -1,7 +1,6 @@
 """Whether a sparse matrix is nonsingular to round-off."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array
@@ -72,17 +71,3 @@ class _Inverse(LinearOperator):
 
     def _adjoint(self) -> LinearOperator:
         return _Inverse(self.factors, not self.transposed)
-
-
-def has_all_pivots(matrix: Any) -> bool:
-    """Whether elimination with partial pivoting finds a pivot beyond round-off in every row, which are scaled to a greatest entry
-    of 1.
-    """
-    rows = abs(matrix).max(1).toarray().reshape(-1)
-    if not rows.all():
-        return False
-    try:
-        factors = splu((diags_array(1 / rows) @ matrix).tocsc())
-    except RuntimeError:
-        return False
-    return float(np.abs(factors.U.diagonal()).min()) > np.finfo(float).eps ** 0.5

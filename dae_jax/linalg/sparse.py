@@ -11,8 +11,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Inexact, Int, PyTree
 
 from ..compiler import compiles
-from .pivoted_lu import PivotedLU
-from .sparse_lu import Indices, eliminated, solved, solved_transposed
+from .pivoted_lu import Augmented, PivotedLU
+from .sparse_lu import eliminated, solved, solved_transposed
+from .storage import cutoff, scaling
 from .symbolic_lu import SymbolicLU, symbolic_lu
 
 
@@ -71,7 +72,7 @@ class Sparse:
         at_hand = lax.stop_gradient(a)
         if not _compiled(a, self.symbolic):
             return (a, None, jnp.asarray(True)), self._pivoted.smallest(at_hand, jnp.asarray(True))
-        factors = eliminated(at_hand, Indices.of(self.symbolic))
+        factors = eliminated(at_hand, self.symbolic)
         poor = ~(factors.largest < float(jnp.finfo(a.dtype).eps) ** -GROWTH)
         smallest = lax.cond(poor, lambda: self._pivoted.smallest(at_hand, poor), lambda: factors.smallest)
         return (a, factors, poor), smallest
@@ -86,7 +87,7 @@ class Sparse:
             if lu is None:
                 return pivoted()
             kernel = solved_transposed if transposed else solved
-            return lax.cond(poor, pivoted, lambda: kernel(lax.stop_gradient(lu), b, Indices.of(self.symbolic)))
+            return lax.cond(poor, pivoted, lambda: kernel(lax.stop_gradient(lu), b, self.symbolic))
 
         return lax.custom_linear_solve(
             lambda x: self.apply(a, x),
@@ -118,22 +119,13 @@ class Sparse:
 
         From r + A x = b and Aᵀ r = ε x.
         """
-        n = self.size
-        largest = jax.ops.segment_max(jnp.abs(a), self.rows, n, indices_are_sorted=True)
-        scale = 1 / jnp.where(largest > 0, largest, 1)
+        scale = scaling(jax.ops.segment_max(jnp.abs(a), self.rows, self.size, indices_are_sorted=True))
         a = a * scale[self.rows]
-        squares = jnp.max(self._row_sums(a * a))
-        cut = 100 * jnp.finfo(a.dtype).eps * jnp.where(squares > 0, squares, 1)
-        entries = jnp.concatenate([jnp.ones_like(b), a, a, jnp.full_like(b, -1) * cut])
-        right = jnp.concatenate([b * scale, jnp.zeros_like(b)])
-        return self._augmented.solve(entries, right)[n:]
+        return self._augmented.solve(a, cutoff(self._row_sums(a * a)), b * scale, jnp.zeros_like(b))[1]
 
     @functools.cached_property
-    def _augmented(self) -> PivotedLU:
-        n, eye = self.size, np.arange(self.size)
-        rows = np.concatenate([eye, self.rows, n + self.columns, n + eye])
-        columns = np.concatenate([eye, n + self.columns, self.rows, n + eye])
-        return PivotedLU(rows, columns, 2 * n)
+    def _augmented(self) -> Augmented:
+        return Augmented(self.rows, self.columns, (self.size, self.size))
 
     def coupled(
         self,
@@ -172,6 +164,4 @@ class Sparse:
 
 def _compiled(a: Inexact[Array, " entries"], symbolic: SymbolicLU) -> bool:
     """Whether our compiler makes the loops: entry by entry in XLA they would take a thousand times as long."""
-    like: Any = lambda x: jax.ShapeDtypeStruct(x.shape, jnp.int32)
-    indices = Indices(*(like(getattr(symbolic, name)) for name in Indices._fields))
-    return compiles(eliminated, jax.ShapeDtypeStruct(a.shape, a.dtype), indices)
+    return compiles(eliminated, *jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (a, symbolic)))

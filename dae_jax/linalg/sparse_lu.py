@@ -9,29 +9,12 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Inexact, Int, PyTree
+from jaxtyping import Array, Float, Inexact, PyTree
 
 from ..compiler import jit
 from ..types import IntScalar
+from .storage import magnitude
 from .symbolic_lu import SymbolicLU
-
-
-class Indices(NamedTuple):
-    """Those of a `SymbolicLU`, as arguments of the kernels: one kernel serves all patterns of a size."""
-
-    rows: Int[Array, " n"]
-    columns: Int[Array, " n"]
-    start: Int[Array, " n+1"]
-    diagonal: Int[Array, " n"]
-    at: Int[Array, " filled"]
-    given_start: Int[Array, " n+1"]
-    given: Int[Array, " entries"]
-    given_at: Int[Array, " entries"]
-
-    @classmethod
-    def of(cls, symbolic: SymbolicLU) -> "Indices":
-        """As 32-bit integers."""
-        return cls(*(jnp.asarray(getattr(symbolic, name), jnp.int32) for name in cls._fields))
 
 
 class Factors(NamedTuple):
@@ -46,7 +29,7 @@ class Factors(NamedTuple):
 
 
 @jit
-def eliminated(a: Inexact[Array, " entries"], k: Indices) -> Factors:
+def eliminated(a: Inexact[Array, " entries"], k: SymbolicLU) -> Factors:
     """The factors of the matrix with entries `a`."""
     real = jnp.finfo(a.dtype).dtype
     zero = jnp.zeros((), real)
@@ -54,7 +37,7 @@ def eliminated(a: Inexact[Array, " entries"], k: Indices) -> Factors:
     def row(i: IntScalar, carry: Any) -> Any:
         lu, work, scales, smallest, largest = carry
         begin, end = _get(k.given_start, i), _get(k.given_start, i + 1)
-        size = lax.fori_loop(begin, end, lambda p, s: jnp.maximum(s, _size(_get(a, _get(k.given, p)))), zero)
+        size = lax.fori_loop(begin, end, lambda p, s: jnp.maximum(s, magnitude(_get(a, _get(k.given, p)))), zero)
         scale = 1 / jnp.where(size > 0, size, 1)
         spread = lambda p, work: _set(work, _get(k.given_at, p), scale * _get(a, _get(k.given, p)))
         work = lax.fori_loop(begin, end, spread, work)
@@ -69,7 +52,7 @@ def eliminated(a: Inexact[Array, " entries"], k: Indices) -> Factors:
             work = lax.fori_loop(
                 pivot + 1, _get(k.start, column + 1), subtract, _set(work, column, jnp.zeros_like(factor))
             )
-            return _set(lu, p, factor), work, jnp.maximum(largest, _size(factor))
+            return _set(lu, p, factor), work, jnp.maximum(largest, magnitude(factor))
 
         lu, work, largest = lax.fori_loop(_get(k.start, i), middle, eliminate, (lu, work, largest))
 
@@ -77,11 +60,17 @@ def eliminated(a: Inexact[Array, " entries"], k: Indices) -> Factors:
             lu, work, largest = carry
             value = _get(work, _get(k.at, q))
             lu, work = _set(lu, q, value), _set(work, _get(k.at, q), jnp.zeros_like(value))
-            return lu, work, jnp.maximum(largest, _size(value))
+            return lu, work, jnp.maximum(largest, magnitude(value))
 
         lu, work, largest = lax.fori_loop(middle, end, keep, (lu, work, largest))
         pivot = _get(lu, middle)
-        return _set(lu, middle, 1 / pivot), work, _set(scales, i, scale), jnp.minimum(smallest, _size(pivot)), largest
+        return (
+            _set(lu, middle, 1 / pivot),
+            work,
+            _set(scales, i, scale),
+            jnp.minimum(smallest, magnitude(pivot)),
+            largest,
+        )
 
     n = k.rows.shape[0]
     begin = jnp.zeros(k.at.shape, a.dtype), jnp.zeros(n, a.dtype), jnp.zeros(n, real), jnp.full((), jnp.inf, real), zero
@@ -90,7 +79,7 @@ def eliminated(a: Inexact[Array, " entries"], k: Indices) -> Factors:
 
 
 @jit
-def solved(factors: Factors, b: Inexact[Array, " n"], k: Indices) -> Inexact[Array, " n"]:
+def solved(factors: Factors, b: Inexact[Array, " n"], k: SymbolicLU) -> Inexact[Array, " n"]:
     """x with A x = b."""
     lu, n = factors.lu, k.rows.shape[0]
     less = lambda p, carry: (carry[0] - _get(lu, p) * _get(carry[1], _get(k.at, p)), carry[1])
@@ -113,7 +102,7 @@ def solved(factors: Factors, b: Inexact[Array, " n"], k: Indices) -> Inexact[Arr
 
 
 @jit
-def solved_transposed(factors: Factors, b: Inexact[Array, " n"], k: Indices) -> Inexact[Array, " n"]:
+def solved_transposed(factors: Factors, b: Inexact[Array, " n"], k: SymbolicLU) -> Inexact[Array, " n"]:
     """x with Aᵀ x = b."""
     lu, n = factors.lu, k.rows.shape[0]
 
@@ -152,8 +141,3 @@ def _set(x: Array, i: Any, value: Array) -> Array:
 
 def _add(x: Array, i: Any, value: Array) -> Array:
     return x.at[i].add(value, mode="promise_in_bounds")
-
-
-def _size(x: Inexact[Array, ""]) -> Float[Array, ""]:
-    """Of the order of |x|."""
-    return jnp.abs(jnp.real(x)) + jnp.abs(jnp.imag(x)) if jnp.iscomplexobj(x) else jnp.abs(x)

@@ -74,7 +74,7 @@ class Dense:
             product = lax.fori_loop(0, self.size, outer, jnp.zeros_like(a))
         else:
             product = jnp.dot(a.T, a, precision=lax.Precision.HIGHEST)
-        factors, _ = self.factor(product + _cut(jnp.sum(a * a, 1)) * jnp.eye(self.size, dtype=a.dtype))
+        factors, _ = self.factor(product + cutoff(jnp.sum(a * a, 1)) * jnp.eye(self.size, dtype=a.dtype))
         return self.solve(factors, jnp.sum(a * (scale * b[:, None]), 0))
 
     def coupled(
@@ -125,7 +125,7 @@ class Banded:
 
     def factor(self, a: Inexact[Array, "n width"]) -> tuple[Any, Float[Array, ""]]:
         """The factors, by Gaussian elimination with partial pivoting in a window that moves down the band."""
-        scale = _scale(_along_rows(jnp.maximum, _size(a)))
+        scale = scaling(_along_rows(jnp.maximum, magnitude(a)))
         lower, reach = self.lower, self.lower + self.upper + 1
         if not lower:
             upper = (a * scale[:, None], scale)
@@ -140,7 +140,7 @@ class Banded:
 
         def eliminate(window: Any, row: Any) -> Any:
             window = jnp.concatenate([window, row[None]])
-            pivot = jnp.argmax(_size(window[:, 0]))
+            pivot = jnp.argmax(magnitude(window[:, 0]))
             pivot_row = lax.dynamic_index_in_dim(window, pivot, 0, keepdims=False)
             rest = jnp.where((places == pivot)[:, None], window[0], window)[1:]
             factors = rest[:, 0] / pivot_row[0]
@@ -192,7 +192,7 @@ class Banded:
         From r + A x = b and Aᵀ r = ε x, which has a band too.
         """
         n, reach = self.size, max(self.lower, self.upper)
-        scale = _scale(_along_rows(jnp.maximum, _size(a)))
+        scale = scaling(_along_rows(jnp.maximum, magnitude(a)))
         a = a * scale[:, None]
         offsets = np.arange(-reach, reach + 1)
         wide = jnp.pad(a, ((0, 0), (reach - self.lower, reach - self.upper)))
@@ -202,7 +202,7 @@ class Banded:
         transposed = jnp.where(inside, wide[np.clip(rows, 0, n - 1), reach - offsets], 0)
         diagonal = jnp.broadcast_to(jnp.asarray(offsets == 0, a.dtype), wide.shape)
         in_place = Banded(np.arange(n), np.arange(n), reach, reach)
-        cut = _cut(_along_rows(jnp.add, a * a))
+        cut = cutoff(_along_rows(jnp.add, a * a))
         both, matrix = in_place.coupled(
             [diagonal, -cut * diagonal], [wide, transposed], jnp.asarray([[0.0, 1.0], [1.0, 0.0]], a.dtype)
         )
@@ -227,17 +227,18 @@ class Banded:
         return band, jnp.stack(rows, 1).reshape(s * n, -1)
 
 
-def _cut(squares: Float[Array, " n"]) -> Float[Array, ""]:
+def cutoff(squares: Float[Array, " n"]) -> Float[Array, ""]:
     """Squared singular values of A below this count as 0, by the sums of squares of its rows."""
     largest = jnp.max(squares)
     return 100 * jnp.finfo(squares.dtype).eps * jnp.where(largest > 0, largest, 1)
 
 
 def _row_scale(a: Inexact[Array, "n k"]) -> Float[Array, " n"]:
-    return _scale(jnp.max(_size(a), 1))
+    return scaling(jnp.max(magnitude(a), 1))
 
 
-def _scale(largest: Float[Array, " n"]) -> Float[Array, " n"]:
+def scaling(largest: Float[Array, " n"]) -> Float[Array, " n"]:
+    """What makes the largest entry of each row 1, of rows that are not 0."""
     return 1 / jnp.where(largest > 0, largest, 1)
 
 
@@ -246,7 +247,7 @@ def _along_rows(combine: Callable[[Array, Array], Array], a: Inexact[Array, "n k
     return functools.reduce(combine, [a[:, k] for k in range(a.shape[1])])
 
 
-def _size(x: Inexact[Array, "*shape"]) -> Float[Array, "*shape"]:
+def magnitude(x: Inexact[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Of the order of |x|, without a square root."""
     return jnp.abs(jnp.real(x)) + jnp.abs(jnp.imag(x)) if jnp.iscomplexobj(x) else jnp.abs(x)
 
@@ -259,7 +260,7 @@ def _inverse(a: Inexact[Array, "n n"]) -> tuple[Inexact[Array, "n n"], Float[Arr
     def eliminate(j: IntScalar, carry: Any) -> Any:
         a, order, smallest = carry
         column = lax.dynamic_slice_in_dim(a, j, 1, 1)[:, 0]
-        pivot = jnp.argmax(jnp.where(places >= j, _size(column), -1))
+        pivot = jnp.argmax(jnp.where(places >= j, magnitude(column), -1))
         row_j = lax.dynamic_index_in_dim(a, j, 0)
         row_pivot = lax.dynamic_index_in_dim(a, pivot, 0)
         value = lax.dynamic_index_in_dim(column, pivot, 0, keepdims=False)
@@ -272,7 +273,7 @@ def _inverse(a: Inexact[Array, "n n"]) -> tuple[Inexact[Array, "n n"], Float[Arr
         a = lax.dynamic_update_slice_in_dim(a - column[:, None] * row, row, j, 0)
         first, second = order[j], order[pivot]
         order = jnp.where(at_j, second, jnp.where(at_pivot, first, order))
-        return a, order, jnp.minimum(smallest, _size(value))
+        return a, order, jnp.minimum(smallest, magnitude(value))
 
     smallest = jnp.asarray(jnp.inf, jnp.finfo(a.dtype).dtype)
     a, order, smallest = lax.fori_loop(0, n, eliminate, (a, places, smallest))

@@ -4,8 +4,7 @@ Equations and unknowns are paired before, each pair is eliminated by its own piv
 pairs with little fill.
 """
 
-import dataclasses
-import functools
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Int
@@ -16,9 +15,9 @@ from jaxtyping import Int
 DOMINANCE = 1e-6
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class SymbolicLU:
-    """L U = P A Q of n unknowns by rows: L below the diagonal without its ones, U from there on. Compared by identity.
+class SymbolicLU(NamedTuple):
+    """L U = P A Q of n unknowns by rows: L below the diagonal without its ones, U from there on. An argument of the kernels that
+    find and use the factors: one kernel serves all patterns of a size.
 
     `rows`, `columns`: which of A stand where; `start`, `diagonal`, `at`: where each row begins and has its diagonal, and the
     columns of its entries; `given_start`, `given`, `given_at`: the same of the entries of A, with their numbers.
@@ -38,7 +37,7 @@ class SymbolicLU:
         """The number of unknowns."""
         return len(self.rows)
 
-    @functools.cached_property
+    @property
     def cost(self) -> int:
         """Multiplications of a factorisation."""
         after = self.start[1:] - self.diagonal - 1
@@ -78,7 +77,7 @@ def symbolic_lu(
     at_row, at_column = position[paired], position[columns]
     given = np.lexsort((at_column, at_row))
     row_of_entry = np.repeat(np.arange(n), np.diff(filled.indptr))
-    return SymbolicLU(
+    indices = (
         np.argsort(pairing)[variables],
         variables,
         filled.indptr,
@@ -88,3 +87,4 @@ def symbolic_lu(
         given,
         at_column[given],
     )
+    return SymbolicLU(*(x.astype(np.int32) for x in indices))

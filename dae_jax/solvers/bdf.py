@@ -15,6 +15,8 @@ from ..types import BoolLike, Time
 from .manifold import time_sign
 from .replay import Replayable
 from .residual_steps import (
+    ALIKE,
+    SAFETY,
     AbstractResidualSolver,
     Iteration,
     Tolerances,
@@ -37,12 +39,10 @@ MAX_ORDER = 5
 ROWS = range(MAX_ORDER + 1)
 # Smaller errors, in parts of the tolerance, do not decide on the order while it rises.
 SIGNIFICANT = 0.01
-# Step sizes that differ by less, relatively, are the same.
-ALIKE = 1e-6
 # A step that is shorter than was wanted, by more than what is left of an interval is shared out by.
 LESS = 0.9
-# The part of the step-size controller in h_new = h · SAFETY · error^(−1 / ERROR_ORDER).
-SAFETY, ERROR_ORDER = 0.9, 2
+# The step-size controller has h_new = h · SAFETY · error^(−1 / ERROR_ORDER).
+ERROR_ORDER = 2
 
 
 class NewtonPolynomial(diffrax.AbstractLocalInterpolation):

@@ -16,6 +16,8 @@ from .radau_coefficients import Coefficients, coefficients
 from .radau_step import CollocationPolynomial, Step, along, coupled, linear_solve
 from .replay import Replayable
 from .residual_steps import (
+    ALIKE,
+    SAFETY,
     AbstractResidualSolver,
     Iteration,
     Tolerances,
@@ -46,11 +48,9 @@ FAST = 1e-2
 PATIENCE = 2.5
 # By which diffrax lets a step grow at most.
 GROWTH = 10
-# Step sizes that differ by less, relatively, are the same: their iteration matrices are.
-ALIKE = 1e-6
 # Where a factorisation takes as long as many steps, a step that could grow by no more than this keeps its size (the program
-# RADAU5); the part of the step-size controller in h_new = h · SAFETY · error^(−1 / order).
-WORTHWHILE, SAFETY = 1.2, 0.9
+# RADAU5).
+WORTHWHILE = 1.2
 
 
 class _State(NamedTuple):
@@ -147,8 +147,9 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
         # What is algebraic may jump in the smallest step.
         bend = constant((rates - state.rates) * (step.h / 2)) * args.structure.differential
         scaled = jnp.where(smallest, bend, counted)
-        failure = of_step(newton.converged, pivot, y0.size, tol.norm(scaled, y0, y1))
-        scaled = scaled * self._held(args, tol.norm(scaled, y0, y1))
+        error = tol.norm(scaled, y0, y1)
+        failure = of_step(newton.converged, pivot, y0.size, error)
+        scaled = scaled * self._held(args, error)
         y1, scaled, result = at_min_step(failure, t0, t1, y0, y1, scaled)
         slow = (newton.theta > FAST) & (newton.count > 1)
         # What jumped says nothing of the next step.

@@ -28,6 +28,10 @@ NOISE = 0.33
 FIRST_LEFT, LEFT, OFF = 0.5, 2, 1000
 # Round-off of the divided differences of algebraic variables, in parts of the variables over h.
 NOISY = 1000
+# Step sizes that differ by less, relatively, are the same: their iteration matrices are.
+ALIKE = 1e-6
+# The part of the step-size controller in h_new = h · SAFETY · error^(−1 / order).
+SAFETY = 0.9
 # How often a correction is halved where algebraic variables jump.
 HALVINGS = 40
 # Where algebraic variables jump, Newton's method has a Jacobian of its own for each of its corrections: damped ones first, for
