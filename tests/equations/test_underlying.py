@@ -5,8 +5,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.sparse import csr_array
 
 import dae_jax
+from dae_jax.equations.derivative_orders import Combination, find_offsets
+from dae_jax.equations.residual_form import ResidualForm
+from dae_jax.equations.sparse_invariants import SparseInvariants
+from dae_jax.equations.structural_ode import Orders, StructuralODE
+from dae_jax.linalg import Tearing
 from dae_jax.scenes import SCENES, pendulum
 
 
@@ -322,3 +328,32 @@ def test_a_state_of_given_derivatives():
     growing = dae_jax.SemiExplicitDAE(lambda t, u, i, e: 1 + u**2 + 0 * i, charging.g)
     with pytest.raises(ValueError, match="No consistent state"):
         dae_jax.consistent_state(growing, 0.0, zero, 2.0, rates=zero)
+
+
+@pytest.mark.parametrize(
+    "name", ["akzo-nobel", "amplifier", "capacitor-loop", "hessenberg-2", "integrators-4", "jay", "robertson"]
+)
+def test_sparse_invariants_are_the_dense_ones(name):
+    """Also where equations stand for combinations of derivatives of others, as in the loop of capacitors."""
+    scene = SCENES[name]()
+    form = ResidualForm.of(scene.system, 0.0, scene.y0, scene.args)
+    ode = StructuralODE.of(form, jnp.float64, complete=True)
+    sparse = SparseInvariants.of(ode, find_offsets(form, jnp.float64).occurrence)
+    y = jnp.asarray(np.random.default_rng(0).uniform(0.1, 1, ode.orders.size))
+    dense = ode.normals(0.3, y)
+    found = np.zeros(dense.shape)
+    np.add.at(found, (sparse.rows, sparse.columns), sparse.entries(ode, 0.3, y))
+    np.testing.assert_allclose(found, dense, rtol=1e-12, atol=1e-12 * np.abs(dense).max())
+
+
+def test_sparse_invariants_of_equations_that_are_made_of_derivatives():
+    """F̄₀ = F₀ + 2 dF₁/dt has ÿ₁, as F₁ has ẏ₁."""
+    system = dae_jax.ImplicitDAE(lambda t, y, yd, args: jnp.stack([yd[0] + y[1], yd[1] * y[0] - t]))
+    form = ResidualForm.of(system, 0.0, jnp.ones(2), None)
+    combination = Combination(((0, ((0, 0, 1.0), (1, 1, 2.0))),))
+    ode = StructuralODE(form, combination, Orders((2, 2), (4, 4)), Tearing())
+    sparse = SparseInvariants.of(ode, csr_array(np.ones((2, 2), bool)))
+    y = jnp.asarray(np.random.default_rng(0).uniform(0.1, 1, ode.orders.size))
+    found = np.zeros((sparse.m, y.size))
+    np.add.at(found, (sparse.rows, sparse.columns), sparse.entries(ode, 0.3, y))
+    np.testing.assert_allclose(found, ode.normals(0.3, y), atol=1e-12)
