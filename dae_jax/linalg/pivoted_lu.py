@@ -59,6 +59,11 @@ class HostFactors:
     lu: Any
     scale: Float[np.ndarray, " n"]
 
+    @property
+    def smallest(self) -> float:
+        """The smallest pivot where the largest entry of each row is 1, 0 of a singular matrix."""
+        return 0.0 if self.lu is None else float(np.abs(self.lu.U.diagonal()).min())
+
     def solve(self, b: np.ndarray, transposed: bool) -> np.ndarray:
         if self.lu is None or not np.isfinite(b).all():
             return np.full_like(b, np.nan)
