@@ -257,6 +257,14 @@ BREAKS = {
         "studies/tune.py", "(point.z + best_z) / 2", "point.z + best_z / 2",
         "tests/studies/test_tune.py::test_holes_are_left_and_never_the_best",
     ),
+    "regression: degrees of freedom": Break(
+        "studies/identify.py", "free = r.size - jnp.sum(found.seen)", "free = r.size",
+        "tests/studies/test_identify.py::test_of_a_linear_model_all_is_that_of_the_normal_equations",
+    ),
+    "regression: variance of a logarithm": Break(
+        "studies/identify.py", "by_value = jnp.where(in_log, 1 / values, 1)", "by_value = jnp.where(in_log, values, 1)",
+        "tests/studies/test_identify.py::test_certified_values_of_a_nonlinear_regression",
+    ),
 }  # fmt: skip
 
 

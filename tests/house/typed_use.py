@@ -155,6 +155,16 @@ def tuned() -> dae_jax.Tuned:
     )
 
 
+def identified() -> dae_jax.Identified:
+    def model(p: dict[str, Array]) -> Array:
+        return p["size"] * np.ones(5)
+
+    found = dae_jax.identify(model, {"size": 1.0}, np.ones(5), 0.1)
+    if found.doubts or found.condition > 30:
+        print(found.names, found.correlation, found.standard_errors)
+    return found
+
+
 def with_settings() -> None:
     with dae_jax.configure(threads=2):
         solved()
