@@ -159,9 +159,10 @@ def identified() -> dae_jax.Identified:
     def model(p: dict[str, Array]) -> Array:
         return p["size"] * np.ones(5)
 
-    found = dae_jax.identify(model, {"size": 1.0}, np.ones(5), 0.1)
+    # Its types are to come.
+    found = dae_jax.identify(model, {"size": 1.0}, np.ones(5), 0.1)  # pyright: ignore[reportUnknownMemberType]
     if found.doubts or found.condition > 30:
-        print(found.names, found.correlation, found.standard_errors)
+        print(found.names, found.correlation, found.deviation)
     return found
 
 
