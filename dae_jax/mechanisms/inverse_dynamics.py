@@ -45,7 +45,7 @@ def inverse_dynamics(
     leading = [joint for joint in mechanism.joints if isinstance(joint, LEADING)]
     if not leading:
         raise ValueError("Nothing leads the mechanism: it has no `point_on_path` and no `motor(..., motion=...)`.")
-    asked = sum(leading_force(mechanism, sol, joint.name) for joint in leading)
+    asked = jnp.sum(jnp.stack([leading_force(mechanism, sol, joint.name) for joint in leading]), 0)
     rows = mechanism.rows()
     taken = np.array([row for joint in leading for row in rows[joint.name][0]])
 
