@@ -84,6 +84,11 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "The iteration matrix ∂F/∂y + c ∂F/∂ẏ is singular, however small the step: the equations do not determine all "
         "unknowns here. `dae_jax.analyse` shows the index and which variable each equation determines."
     )
+    undetermined = (
+        "On its way the solution has passed states at which the equations do not determine all unknowns: the matrix of their highest "
+        "derivatives is singular to round-off, and what it leaves open could be any number there. `dae_jax.analyse` shows which "
+        "variable each equation determines."
+    )
     no_convergence = (
         "Newton's method did not converge for the equations of a step, however small: a function has a jump or a kink "
         "there, leaves its domain (NaN), or the equations have no solution beyond. For an index of 3, try a form of lower "

@@ -25,7 +25,7 @@ from ..solvers import (
     takes_residuals,
 )
 from ..types import Args, BoolLike, Time, Y
-from .passages import passages, watched
+from .passages import Undetermined, passages, watched
 from .problem import Problem
 from .start import is_saved_part
 from .summed_errors import SummedErrors
@@ -90,7 +90,7 @@ def call(solve: "Solve", problem: Problem) -> tuple[Any, ...]:
     saveat = dataclasses.replace(saveat, solver_state=True) if counts(solver) else saveat
     sums_errors = isinstance(controller, diffrax.ConstantStepSize) and not solve.recording
     controller = SummedErrors(controller) if sums_errors else controller
-    passage = passages(problem, solve.formulation.decode, not solve.keeps()[0])
+    passage = passages(problem, ode, solve.formulation.decode, not solve.keeps()[0])
     controller = controller if passage is None else watched(controller, passage)
     if sums_errors or passage is not None:
         saveat = dataclasses.replace(saveat, controller_state=True)
@@ -113,6 +113,8 @@ def call(solve: "Solve", problem: Problem) -> tuple[Any, ...]:
     stats.update((path.split(".")[-1], operator.attrgetter(path)(sol.solver_state)) for path in counts(solver))
     state = lax.stop_gradient(cast(Any, sol.controller_state))
     state, passed = (state, False) if passage is None else (state.steps, state.passed)
+    if isinstance(passage, Undetermined):
+        result, passed = RESULTS.where((result == RESULTS.successful) & passed, RESULTS.undetermined, result), False
     seen = state[-1] if sums_errors else None, passed
     return sol.t0, sol.t1, ts["user"], ys["user"], interpolation, stats, result, sol.event_mask, seen, end
 

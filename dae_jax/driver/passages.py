@@ -1,4 +1,5 @@
-"""Steps that pass a configuration in which the constraints depend on each other, such as a dead centre, or leap over one.
+"""Steps that pass a configuration in which the constraints depend on each other, such as a dead centre, or leap over one, and steps
+to states at which the equations do not determine all unknowns.
 
 They are not tried again with a smaller step: what really passes such a point, a parallelogram say, can only leap.
 """
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 from ..equations.manifold_ode import Equations
 from ..equations.mechanical import MechanicalODE
 from ..equations.regularity import passes_singularity
+from ..equations.structural_ode import StructuralODE
 from ..systems import is_mechanism
 from ..types import BoolScalar, Time, Y
 from .problem import Problem
@@ -36,8 +38,22 @@ class Passage(eqx.Module):
         return passes_singularity(self.ode, t0, at(t0, y0), t1, at(t1, y1), self.drifts)
 
 
-def passages(problem: Problem, decode: Callable[..., Any], drifts: bool) -> Passage | None:
-    """What sees passages in the solution of a problem: of a mechanism with few constraints."""
+class Undetermined(eqx.Module):
+    """Whether a step of an explicit method ends where the equations do not determine all highest derivatives."""
+
+    def __call__(self, t0: Time, y0: Y, t1: Time, y1: Y, equations: Equations) -> BoolScalar:
+        assert isinstance(equations, StructuralODE)
+        return ~equations.determines_highest(t1, y1)
+
+
+def passages(
+    problem: Problem, ode: Equations, decode: Callable[..., Any], drifts: bool
+) -> Passage | Undetermined | None:
+    """What sees them in the solution of a problem, by the equations that are integrated: in that of a mechanism with few
+    constraints, or where the matrix of highest derivatives is not constant.
+    """
+    if isinstance(ode, StructuralODE):
+        return Undetermined() if ode.varies else None
     system, t, state, args = problem.start
     if not is_mechanism(system):
         return None
@@ -45,7 +61,7 @@ def passages(problem: Problem, decode: Callable[..., Any], drifts: bool) -> Pass
     return Passage(ode, decode, drifts) if 0 < ode.holonomic <= MOST else None
 
 
-def watched(controller: diffrax.AbstractStepSizeController, passage: Passage) -> "_AbstractWatchedSteps":
+def watched(controller: diffrax.AbstractStepSizeController, passage: Passage | Undetermined) -> "_AbstractWatchedSteps":
     """The controller with an eye on passages."""
     adapts = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
     watched_steps: Any = WatchedAdaptiveSteps if adapts else WatchedSteps
@@ -63,7 +79,7 @@ class _AbstractWatchedSteps(diffrax.AbstractStepSizeController):
     """The steps of another controller."""
 
     steps: eqx.AbstractVar[Any]
-    passage: eqx.AbstractVar[Passage]
+    passage: eqx.AbstractVar[Passage | Undetermined]
     direction: eqx.AbstractVar[Any]
 
     def wrap(self, direction: Any) -> Any:
@@ -97,7 +113,7 @@ class WatchedSteps(_AbstractWatchedSteps):
     """Steps of a controller without tolerances."""
 
     steps: Any
-    passage: Passage
+    passage: Passage | Undetermined
     direction: Any = 1
 
 
@@ -105,7 +121,7 @@ class WatchedAdaptiveSteps(_AbstractWatchedSteps, diffrax.AbstractAdaptiveStepSi
     """Steps of a controller with tolerances."""
 
     steps: Any
-    passage: Passage
+    passage: Passage | Undetermined
     direction: Any = 1
 
     @property

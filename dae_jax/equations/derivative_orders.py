@@ -48,6 +48,11 @@ class Combination:
     def _replaced(self) -> dict[int, tuple[tuple[int, int, float], ...]]:
         return dict(self.rows)
 
+    @functools.cached_property
+    def of_sizes(self) -> "Combination":
+        """The same of the sizes of terms."""
+        return Combination(tuple((i, tuple((j, k, abs(a)) for j, k, a in terms)) for i, terms in self.rows))
+
     def terms(self, equation: int) -> tuple[tuple[int, int, float], ...]:
         """What F̄ₗ is made of."""
         return self._replaced.get(equation, ((equation, 0, 1.0),))

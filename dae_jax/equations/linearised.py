@@ -29,6 +29,7 @@ from .derivative_orders import Combination, Offsets, find_offsets
 from .index1_form import Index1Form
 from .initial_rates import is_nonlinear, rates_of
 from .manifold_ode import at_one_instant
+from .probe import Probe
 from .residual_form import LARGE, ResidualForm
 
 
@@ -124,20 +125,26 @@ class LinearisedResidual(eqx.Module):
         of = lambda x: self.residual(*(x if k == argument else given for k, given in enumerate(point)))
         return compression.jacobian(of, point[argument])
 
-    def factor(self, j: Array, m: Array, c: Inexact[Array, ""], h: Time) -> tuple[Any, Float[Array, ""]]:
-        """The factors of J + c M, for c of the order of 1/h, and the smallest pivot, of round-off size for a singular one.
+    def factor(self, j: Array, m: Array, c: Inexact[Array, ""], h: Time) -> Any:
+        """The factors of J + c M, for c of the order of 1/h.
 
         With column j scaled by h^dⱼ, the rows tend with h → 0 to those of the Σ-method's system Jacobian, however high the
         index, or of the combination's; without, the condition would grow like h^(−index).
         """
         scale = self.column_scale(h)
-        matrix = self.storage.scale_columns(self._combined(j + c * m, c), scale)
-        factors, smallest = self.storage.factor(matrix)
-        return (factors, scale, c), smallest
+        matrix = self.storage.scale_columns(self.combined(j + c * m, c), scale)
+        return self.storage.factor(matrix), scale, c
+
+    def probe(self, j: Array, m: Array, factors: PyTree) -> Probe:
+        """That of J + c M by its factors."""
+        _, scale, c = factors
+        matrix = jax.lax.stop_gradient(j + c * m)
+        return Probe.of(functools.partial(self.storage.apply, matrix), functools.partial(self.solve, factors), scale)
 
     def round_off(self, j: Array, m: Array, c: Inexact[Array, ""], size: Float[Array, " n"]) -> Float[Array, " n"]:
-        """The round-off of each equation, (|J| + |c M|) ε, for variables of that `size`."""
-        return self.storage.apply(jnp.abs(j) + jnp.abs(c * m), size) * jnp.finfo(size.dtype).eps
+        """The round-off of each of the combined equations, (|J| + |c M|) ε, for variables of that `size`."""
+        terms = self.storage.apply(jnp.abs(j) + jnp.abs(c * m), size)
+        return _combined(self.structure.combination.of_sizes, terms, jnp.abs(c)) * jnp.finfo(size.dtype).eps
 
     def column_scale(self, h: Time) -> Float[Array, " n"]:
         """h^dⱼ."""
@@ -146,12 +153,11 @@ class LinearisedResidual(eqx.Module):
     def solve(self, factors: PyTree, b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
         """x with (J + c M) x = b."""
         inner, scale, c = factors
-        return scale * self.storage.solve(inner, self._combined(b, c))
+        return scale * self.storage.solve(inner, self.combined(b, c))
 
-    def _combined(self, rows: Array, c: Inexact[Array, ""]) -> Any:
+    def combined(self, rows: Array, c: Inexact[Array, ""]) -> Any:
         """Rows, or right-hand sides, in the combination in which highest derivatives do not cancel, with c for d/dt."""
-        combination = self.structure.combination
-        return combination.of([rows * c**k if k else rows for k in range(combination.degree + 1)])[0]
+        return _combined(self.structure.combination, rows, c)
 
     def rates(self, t: Time, y: Float[Array, " n"]) -> Float[Array, " n"]:
         """ẏ with F(t, y, ẏ) = 0 where y is consistent, else with the least F; for variables whose derivative does not occur
@@ -203,6 +209,10 @@ class LinearisedResidual(eqx.Module):
     def counted(self, dense: bool) -> Bool[np.ndarray, " n"]:
         """Which variables are of index 0 or 1, or seen by the user where values between steps are wanted."""
         return (np.array(self.structure.indices) <= 1) | (dense & self.form.shown)
+
+
+def _combined(combination: Combination, rows: Array, c: Inexact[Array, ""]) -> Any:
+    return combination.of([rows * c**k if k else rows for k in range(combination.degree + 1)])[0]
 
 
 def powers(x: Float[Array, ""], exponents: tuple[int, ...]) -> Float[Array, " n"]:

@@ -33,6 +33,7 @@ from .derivative_orders import Combination, derivative_of, find_offsets
 from .initial_rates import is_nonlinear, rates_of
 from .manifold_ode import Feedback, ManifoldODE, at_one_instant
 from .mechanical import MechanicalODE
+from .probe import Probe
 from .residual_form import LARGE, ResidualForm
 from .sparse_invariants import SparseInvariants
 from .taylor import total_derivatives
@@ -124,6 +125,8 @@ class StructuralODE(ManifoldODE):
     orders: Orders = eqx.field(static=True)
     tearing: Tearing = eqx.field(static=True)
     sparse: SparseInvariants | None = eqx.field(static=True, default=None)
+    # Whether the matrix of the equations for X depends on anything.
+    varies: bool = eqx.field(static=True, default=True)
 
     @classmethod
     def of(cls, form: ResidualForm, dtype: DType, complete: bool = False) -> "StructuralODE":
@@ -150,7 +153,8 @@ class StructuralODE(ManifoldODE):
         present = np.zeros_like(known, bool)
         for i, variables in enumerate(found.pattern):
             present[i, variables] = True
-        return dataclasses.replace(ode, tearing=tearing(np.where(present, known, 0)))
+        known = np.where(present, known, 0)
+        return dataclasses.replace(ode, tearing=tearing(known), varies=bool(np.isnan(known).any()))
 
     def _coefficients(self, dtype: DType) -> tuple[bool, Float[np.ndarray, "n n"]]:
         """Whether the highest derivatives enter linearly, that is whether their coefficients do not depend on them, and
@@ -207,6 +211,13 @@ class StructuralODE(ManifoldODE):
     def highest(self, t: Time, y: Float[Array, " N"], feedback: Feedback | None = None) -> Float[Array, " n"]:
         """X, the derivatives of order Dⱼ."""
         return self.tearing.solve(*self._system(t, y, feedback))
+
+    @at_one_instant
+    def determines_highest(self, t: Time, y: Float[Array, " N"]) -> Bool[Array, ""]:
+        """Whether the equations for X determine all of it, to round-off."""
+        matrix = lax.stop_gradient(self._system(t, y, None)[0])
+        apply = lambda x: jnp.sum(matrix * x, 1)
+        return Probe.of(apply, lambda b: self.tearing.solve(matrix, b), jnp.ones(self.form.size, y.dtype)).determined
 
     # The underlying ODE and the manifold
 

@@ -25,14 +25,6 @@ class PivotedLU:
     columns: Int[np.ndarray, " entries"]
     size: int
 
-    def smallest(self, a: Inexact[Array, " entries"], needed: Bool[Array, ""]) -> Float[Array, ""]:
-        """The smallest pivot where the largest entry of each row is 1, 0 of a matrix that is singular or not finite; only where
-        it is `needed`.
-        """
-        real = jnp.finfo(a.dtype).dtype
-        on_host = lambda a, needed: np.asarray(_remembered(self, *_key(a)).smallest if needed else 0.0, real)
-        return jax.pure_callback(on_host, jax.ShapeDtypeStruct((), real), a, needed, vmap_method="sequential")
-
     def solve(self, a: Inexact[Array, " entries"], b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
         """x with A x = b, and its derivative; NaN where A is singular or not finite."""
         apply = lambda x: jax.ops.segment_sum(a * x[self.columns], self.rows, self.size)
@@ -69,6 +61,7 @@ class HostFactors:
 
     @property
     def smallest(self) -> float:
+        """The smallest pivot where the largest entry of each row is 1, 0 of a singular matrix."""
         return 0.0 if self.lu is None else float(np.abs(self.lu.U.diagonal()).min())
 
     def solve(self, b: np.ndarray, transposed: bool) -> np.ndarray:

@@ -67,15 +67,12 @@ class Sparse:
         """Row and column of each entry."""
         return self.rows, self.columns
 
-    def factor(self, a: Inexact[Array, " entries"]) -> tuple[Any, Float[Array, ""]]:
-        """The factors, and the smallest pivot relative to the entries of its row: round-off where A is singular."""
-        at_hand = lax.stop_gradient(a)
+    def factor(self, a: Inexact[Array, " entries"]) -> Any:
+        """The factors."""
         if not _compiled(a, self.symbolic):
-            return (a, None, jnp.asarray(True)), self._pivoted.smallest(at_hand, jnp.asarray(True))
-        factors = eliminated(at_hand, self.symbolic)
-        poor = ~(factors.largest < float(jnp.finfo(a.dtype).eps) ** -GROWTH)
-        smallest = lax.cond(poor, lambda: self._pivoted.smallest(at_hand, poor), lambda: factors.smallest)
-        return (a, factors, poor), smallest
+            return a, None, jnp.asarray(True)
+        factors = eliminated(lax.stop_gradient(a), self.symbolic)
+        return a, factors, ~(factors.largest < float(jnp.finfo(a.dtype).eps) ** -GROWTH)
 
     def solve(self, factors: PyTree, b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
         """x with A x = b; A's derivative is that of the equation."""

@@ -18,13 +18,12 @@ from .symbolic_lu import SymbolicLU
 
 
 class Factors(NamedTuple):
-    """`lu`: the factors, with the inverse of each pivot in its place; `scale`: of the rows; the `smallest` pivot, and the
-    `largest` number of the factors, where the largest of each row of A is 1.
+    """`lu`: the factors, with the inverse of each pivot in its place; `scale`: of the rows; the `largest` number
+    of the factors, where that of each row of A is 1.
     """
 
     lu: Inexact[Array, " filled"]
     scale: Float[Array, " n"]
-    smallest: Float[Array, ""]
     largest: Float[Array, ""]
 
 
@@ -35,7 +34,7 @@ def eliminated(a: Inexact[Array, " entries"], k: SymbolicLU) -> Factors:
     zero = jnp.zeros((), real)
 
     def row(i: IntScalar, carry: Any) -> Any:
-        lu, work, scales, smallest, largest = carry
+        lu, work, scales, largest = carry
         begin, end = _get(k.given_start, i), _get(k.given_start, i + 1)
         size = lax.fori_loop(begin, end, lambda p, s: jnp.maximum(s, magnitude(_get(a, _get(k.given, p)))), zero)
         scale = 1 / jnp.where(size > 0, size, 1)
@@ -63,19 +62,12 @@ def eliminated(a: Inexact[Array, " entries"], k: SymbolicLU) -> Factors:
             return lu, work, jnp.maximum(largest, magnitude(value))
 
         lu, work, largest = lax.fori_loop(middle, end, keep, (lu, work, largest))
-        pivot = _get(lu, middle)
-        return (
-            _set(lu, middle, 1 / pivot),
-            work,
-            _set(scales, i, scale),
-            jnp.minimum(smallest, magnitude(pivot)),
-            largest,
-        )
+        return _set(lu, middle, 1 / _get(lu, middle)), work, _set(scales, i, scale), largest
 
     n = k.rows.shape[0]
-    begin = jnp.zeros(k.at.shape, a.dtype), jnp.zeros(n, a.dtype), jnp.zeros(n, real), jnp.full((), jnp.inf, real), zero
-    lu, _, scale, smallest, largest = lax.fori_loop(0, n, row, begin)
-    return Factors(lu, scale, smallest, largest)
+    begin = jnp.zeros(k.at.shape, a.dtype), jnp.zeros(n, a.dtype), jnp.zeros(n, real), zero
+    lu, _, scale, largest = lax.fori_loop(0, n, row, begin)
+    return Factors(lu, scale, largest)
 
 
 @jit

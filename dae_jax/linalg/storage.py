@@ -39,14 +39,12 @@ class Dense:
         rows, columns = np.indices((self.size, self.size))
         return rows, columns
 
-    def factor(self, a: Inexact[Array, "n n"]) -> tuple[Any, Float[Array, ""]]:
-        """The factors, and the smallest pivot relative to the entries of its row: round-off where A is singular."""
+    def factor(self, a: Inexact[Array, "n n"]) -> Any:
+        """The factors."""
         scale = _row_scale(a)
         if self.size <= LOOPED:
-            inverse, smallest = _inverse(a * scale[:, None])
-            return inverse * scale, smallest
-        lu, pivots, order = lax.linalg.lu(a * scale[:, None])
-        return (lu, pivots, order, scale), jnp.min(jnp.abs(jnp.diagonal(lu)))
+            return _inverse(a * scale[:, None]) * scale
+        return (*lax.linalg.lu(a * scale[:, None]), scale)
 
     def solve(self, factors: PyTree, b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
         """x with A x = b."""
@@ -74,7 +72,7 @@ class Dense:
             product = lax.fori_loop(0, self.size, outer, jnp.zeros_like(a))
         else:
             product = jnp.dot(a.T, a, precision=lax.Precision.HIGHEST)
-        factors, _ = self.factor(product + cutoff(jnp.sum(a * a, 1)) * jnp.eye(self.size, dtype=a.dtype))
+        factors = self.factor(product + cutoff(jnp.sum(a * a, 1)) * jnp.eye(self.size, dtype=a.dtype))
         return self.solve(factors, jnp.sum(a * (scale * b[:, None]), 0))
 
     def coupled(
@@ -123,13 +121,12 @@ class Banded:
         columns = np.where(inside, self.columns[np.clip(places, 0, self.size - 1)], -1)
         return np.broadcast_to(self.rows[:, None], columns.shape), columns
 
-    def factor(self, a: Inexact[Array, "n width"]) -> tuple[Any, Float[Array, ""]]:
+    def factor(self, a: Inexact[Array, "n width"]) -> Any:
         """The factors, by Gaussian elimination with partial pivoting in a window that moves down the band."""
         scale = scaling(_along_rows(jnp.maximum, magnitude(a)))
         lower, reach = self.lower, self.lower + self.upper + 1
         if not lower:
-            upper = (a * scale[:, None], scale)
-            return upper, jnp.min(jnp.abs(upper[0][:, 0]))
+            return a * scale[:, None], scale
         # Row i + lower joins when column i is eliminated; below the matrix stands the identity.
         rows = jnp.concatenate([a * scale[:, None], jnp.zeros((lower, self.width), a.dtype)])
         padded = jnp.pad(rows, ((0, 0), (0, reach - self.width)))
@@ -148,7 +145,7 @@ class Banded:
             return jnp.pad(rest, ((0, 0), (0, 1))), (pivot_row, factors, pivot)
 
         _, (upper, factors, pivots) = lax.scan(eliminate, window, padded[lower:])
-        return (upper, factors, pivots, scale), jnp.min(jnp.abs(upper[:, 0]))
+        return upper, factors, pivots, scale
 
     def solve(self, factors: PyTree, b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
         """x with A x = b."""
@@ -206,7 +203,7 @@ class Banded:
         both, matrix = in_place.coupled(
             [diagonal, -cut * diagonal], [wide, transposed], jnp.asarray([[0.0, 1.0], [1.0, 0.0]], a.dtype)
         )
-        factors, _ = both.factor(matrix)
+        factors = both.factor(matrix)
         right = jnp.stack([b[self.rows] * scale, jnp.zeros_like(b)], 1).reshape(-1)
         return both.solve(factors, right)[1::2][np.argsort(self.columns)]
 
@@ -252,13 +249,13 @@ def magnitude(x: Inexact[Array, "*shape"]) -> Float[Array, "*shape"]:
     return jnp.abs(jnp.real(x)) + jnp.abs(jnp.imag(x)) if jnp.iscomplexobj(x) else jnp.abs(x)
 
 
-def _inverse(a: Inexact[Array, "n n"]) -> tuple[Inexact[Array, "n n"], Float[Array, ""]]:
-    """The inverse by Gauss–Jordan elimination with partial pivoting, in place, and the smallest pivot."""
+def _inverse(a: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
+    """The inverse by Gauss–Jordan elimination with partial pivoting, in place."""
     n = a.shape[0]
     places = jnp.arange(n)
 
     def eliminate(j: IntScalar, carry: Any) -> Any:
-        a, order, smallest = carry
+        a, order = carry
         column = lax.dynamic_slice_in_dim(a, j, 1, 1)[:, 0]
         pivot = jnp.argmax(jnp.where(places >= j, magnitude(column), -1))
         row_j = lax.dynamic_index_in_dim(a, j, 0)
@@ -273,10 +270,9 @@ def _inverse(a: Inexact[Array, "n n"]) -> tuple[Inexact[Array, "n n"], Float[Arr
         a = lax.dynamic_update_slice_in_dim(a - column[:, None] * row, row, j, 0)
         first, second = order[j], order[pivot]
         order = jnp.where(at_j, second, jnp.where(at_pivot, first, order))
-        return a, order, jnp.minimum(smallest, magnitude(value))
+        return a, order
 
-    smallest = jnp.asarray(jnp.inf, jnp.finfo(a.dtype).dtype)
-    a, order, smallest = lax.fori_loop(0, n, eliminate, (a, places, smallest))
+    a, order = lax.fori_loop(0, n, eliminate, (a, places))
     # The columns of the inverse are those of the rows as they were exchanged.
     back = jnp.sum(jnp.where(order[:, None] == places, places[:, None], 0), 0)
-    return a[:, back], smallest
+    return a[:, back]

@@ -100,10 +100,11 @@ class _State(NamedTuple):
 
 
 class _Factors(NamedTuple):
-    """The factors of the iteration `matrix`, and what may be `round_off` of each equation."""
+    """The factors of the iteration `matrix`, what may be `round_off` of each equation, and its `probe`."""
 
     matrix: Any
     round_off: Float[Array, " n"]
+    probe: Any
 
 
 class _Step(NamedTuple):
@@ -121,11 +122,12 @@ class _Step(NamedTuple):
         """F at the new point."""
         return self.linearised.residual(self.sign * self.t1, y, self.sign * (self.rate + self.c * (y - self.y)))
 
-    def factor(self, y: Float[Array, " n"], tol: Tolerances) -> tuple[_Factors, Float[Array, ""]]:
-        """The factors of ∂F/∂y + c ∂F/∂ẏ, and the smallest pivot."""
+    def factor(self, y: Float[Array, " n"], tol: Tolerances) -> _Factors:
+        """The factors of ∂F/∂y + c ∂F/∂ẏ."""
         j, m = self.linearised.jacobians(self.sign * self.t1, y, self.sign * (self.rate + self.c * (y - self.y)))
-        factors, pivot = self.linearised.factor(j, m, self.sign * self.c, self.h)
-        return _Factors(factors, tol.round_off(self.linearised, j, m, self.c, self.y)), pivot
+        factors = self.linearised.factor(j, m, self.sign * self.c, self.h)
+        round_off = tol.round_off(self.linearised, j, m, self.c, self.y)
+        return _Factors(factors, round_off, self.linearised.probe(j, m, factors))
 
 
 class BDF(Replayable, AbstractResidualSolver):
@@ -178,7 +180,7 @@ class BDF(Replayable, AbstractResidualSolver):
         sign = time_sign(terms, t0, t1)
         like = _Step(args, sign, t1, t1 - t0, 1 / (t1 - t0), y0, y0)
         tol = tolerances(self.rtol, self.atol, y0.dtype)
-        factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda: like.factor(y0, tol)[0]))
+        factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda: like.factor(y0, tol)))
         return _start(sign * args.start, factors, Work.none())
 
     def invalidate_jacobian(self, state: _State) -> _State:
@@ -206,7 +208,7 @@ class BDF(Replayable, AbstractResidualSolver):
         tol = tolerances(self.rtol, self.atol, y0.dtype)
         k, method = state.order, _formula(state.order, state.steps == 0, state.psi, h)
         step, star = _predicted(method, k, state.phi, args, sign, t1, h, y0)
-        y1, (newton, passes, factors, pivot, work) = _point(
+        y1, (newton, passes, factors, work) = _point(
             lambda params: _solve(*params), (step, *constant((y0, state, is_smallest(t0, t1))), tol)
         )
         change, phi = _differences(y1 - step.y, star, k)
@@ -222,7 +224,7 @@ class BDF(Replayable, AbstractResidualSolver):
         smooth = method.tail * size(change * args.structure.differential) < 1
         jumped = constant(is_smallest(t0, t1) & newton.converged & (passes | (decision.factor < SAFETY)) & smooth)
         error = (jnp.where(jumped, 2, decision.factor) / SAFETY) ** -ERROR_ORDER
-        failure = of_step(newton.converged, pivot, y0.size, error)
+        failure = of_step(newton.converged, factors.probe.determined, error)
         error = jnp.where(newton.converged, error, jnp.inf) * tol.scale(y0, y1)
         y1, error, result = at_min_step(failure, t0, t1, y0, y1, constant(error))
         phi = jnp.stack(phi)
@@ -276,7 +278,7 @@ def _point(iterate: Callable[[Any], Any], params: Any) -> tuple[Float[Array, " n
         params,
         linear_solve=lambda inverse, b: inverse(b),
         jacobian=lambda y, params: functools.partial(
-            params[0].linearised.solve, params[0].factor(y, params[-1])[0].matrix
+            params[0].linearised.solve, params[0].factor(y, params[-1]).matrix
         ),
     )
 
@@ -357,13 +359,14 @@ def _solve(step: _Step, y0: Any, state: _State, smallest: Any, tol: Tolerances) 
     changed = jnp.abs(step.c - state.c) > ALIKE * step.c
 
     def attempt(carry: Any) -> Any:
-        tries, fresh, before, factors, _, work = carry
+        tries, fresh, before, _, factors, work = carry
         renew = (tries > 0) | changed
-        start = start_of(tries, step.y, before.x)
+        start = start_of(tries, step.y, before)
         new = lambda: step.factor(start, tol)
-        factors, pivot = lax.cond(renew, new, lambda: (factors, jnp.full_like(step.c, jnp.inf)))
+        factors = lax.cond(renew, new, lambda: factors)
         correction = lambda residual: -step.linearised.solve(factors.matrix, residual)
-        iteration = Iteration(step.residual, correction, factors.round_off)
+        combined = lambda rows: step.linearised.combined(rows, step.c)
+        iteration = Iteration(step.residual, correction, combined, factors.round_off)
         scale = lambda y: weights / tol.scale(y0, y)
         eta = jnp.where(renew, 1, state.eta)
         newton = lax.cond(
@@ -371,20 +374,23 @@ def _solve(step: _Step, y0: Any, state: _State, smallest: Any, tol: Tolerances) 
             lambda: corrected(iteration, start, tries, scale, differential, eta, tol),
             lambda: simplified_newton(iteration, start, weights / tol.scale(y0), eta, tol),
         )
-        return tries + 1, fresh | renew, newton, factors, pivot, work.and_of(renew, renew, newton.count)
+        solve = functools.partial(step.linearised.solve, factors.matrix)
+        seen = before.converged | factors.probe.determines(solve, step.residual, newton.x)
+        return tries + 1, fresh | renew, newton, seen, factors, work.and_of(renew, renew, newton.count)
 
     def again(carry: Any) -> Any:
-        tries, fresh, newton, *_ = carry
-        return goes_on(tries, newton.converged, fresh, smallest)
+        tries, fresh, newton, seen, *_ = carry
+        return goes_on(tries, newton.converged, seen, fresh, smallest)
 
-    first = (0, jnp.asarray(False), not_begun(step.y, state.eta), state.factors, jnp.zeros_like(step.h), state.work)
-    _, fresh, newton, factors, pivot, work = lax.while_loop(again, attempt, first)
+    no = jnp.asarray(False)
+    first = (0, no, not_begun(step.y, state.eta), no, state.factors, state.work)
+    _, fresh, newton, _, factors, work = lax.while_loop(again, attempt, first)
     # The rate with new factors says nothing of the next step, for which they are old.
     eta = jnp.where(fresh, 1, newton.eta)
     passes = passes_a_kink(newton, smallest, state.steps > 0)
     y = jnp.where(newton.converged | passes & differential, newton.x, jnp.where(passes, y0, step.y))
     found = newton._replace(x=None, eta=eta, converged=newton.converged | passes)
-    return y, (found, passes, factors, pivot, work)
+    return y, (found, passes, factors, work)
 
 
 class _Decision(NamedTuple):

@@ -102,7 +102,7 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
         zero = jnp.zeros((), y0.dtype)
         step = Step(coefficients(self.stages), args, sign, t0, t1, y0)
         tol = self._tolerances(y0.dtype)
-        unused = jax.eval_shape(lambda: (j := step.jacobians(t0, y0, y0), step.factor(j, tol)[0]))
+        unused = jax.eval_shape(lambda: (j := step.jacobians(t0, y0, y0), step.factor(j, tol)))
         jacobians, factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), unused)
         return _State(
             jnp.zeros((self.stages, y0.size), y0.dtype),
@@ -134,9 +134,7 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
         )
         step = Step(coefficients(self.stages), args, time_sign(terms, t0, t1), t0, t1, y0)
         tol = self._tolerances(y0.dtype)
-        z, (newton, jacobians, factors, pivot, work) = _stages(
-            lambda params: _solve(*params), (step, constant(state), tol)
-        )
+        z, (newton, jacobians, factors, work) = _stages(lambda params: _solve(*params), (step, constant(state), tol))
         y1 = y0 + z[-1]
         scaled = counted = _error(*constant((step, factors.real, z)), tol=tol) * args.weights(step.h)
         if args.between(self.dense).any():
@@ -148,7 +146,7 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
         bend = constant((rates - state.rates) * (step.h / 2)) * args.structure.differential
         scaled = jnp.where(smallest, bend, counted)
         error = tol.norm(scaled, y0, y1)
-        failure = of_step(newton.converged, pivot, y0.size, error)
+        failure = of_step(newton.converged, factors.probe.determined, error)
         scaled = scaled * self._held(args, error)
         y1, scaled, result = at_min_step(failure, t0, t1, y0, y1, scaled)
         slow = (newton.theta > FAST) & (newton.count > 1)
@@ -282,21 +280,18 @@ def _solve(step: Step, state: _State, tol: Tolerances) -> Any:
     weights, differential = step.linearised.weights(h, tol.raised()), step.linearised.structure.differential
 
     def attempt(carry: Any) -> Any:
-        tries, fresh, before, jacobians, factors, _, work = carry
+        tries, fresh, before, _, jacobians, factors, work = carry
         renew = (tries > 0) | state.refresh | smallest
-        start = start_of(tries, jnp.where(tries == 0, predicted, 0), before.x)
-        t, y = jnp.where(smallest, step.t1, step.t0), jnp.where(smallest, step.y0 + start[-1], step.y0)
+        start = start_of(tries, jnp.where(tries == 0, predicted, 0), before)
+        at_end = smallest | before.converged
+        t, y = jnp.where(at_end, step.t1, step.t0), jnp.where(at_end, step.y0 + start[-1], step.y0)
         evaluate = lambda: step.jacobians(step.sign * t, y, state.rates)
         jacobians = lax.cond(renew, evaluate, lambda: jacobians)
-        infinite = jnp.full_like(h, jnp.inf)
         refactor = renew | (jnp.abs(h - state.factored) > ALIKE * h)
-        factors, pivot = lax.cond(
-            refactor,
-            lambda: step.factor(jacobians, tol),
-            lambda: (factors, infinite),
-        )
+        factors = lax.cond(refactor, lambda: step.factor(jacobians, tol), lambda: factors)
         correction = lambda residuals: step.correction(factors, residuals)
-        iteration = Iteration(step.residuals, correction, factors.round_off)
+        combined = lambda rows: jnp.stack([step.linearised.combined(row, 1 / h) for row in rows])
+        iteration = Iteration(step.residuals, correction, combined, factors.round_off)
         scale = lambda z: weights / tol.scale(step.y0, step.y0 + z[-1])
         newton = lax.cond(
             smallest & (tries > 0),
@@ -304,19 +299,20 @@ def _solve(step: Step, state: _State, tol: Tolerances) -> Any:
             lambda: simplified_newton(iteration, start, weights / tol.scale(step.y0), state.eta, tol),
         )
         work = work.and_of(renew, refactor, newton.count)
-        return tries + 1, fresh | renew, newton, jacobians, factors, pivot, work
+        seen = before.converged | step.determines(factors, newton.x)
+        return tries + 1, fresh | renew, newton, seen, jacobians, factors, work
 
     def again(carry: Any) -> Any:
-        tries, fresh, newton, *_ = carry
-        return goes_on(tries, newton.converged, fresh, smallest)
+        tries, fresh, newton, seen, *_ = carry
+        return goes_on(tries, newton.converged, seen, fresh, smallest)
 
-    none = not_begun(predicted, state.eta)
-    first = (0, jnp.asarray(False), none, state.jacobians, state.factors, h, state.work)
-    _, _, newton, jacobians, factors, pivot, work = lax.while_loop(again, attempt, first)
+    none, no = not_begun(predicted, state.eta), jnp.asarray(False)
+    first = (0, no, none, no, state.jacobians, state.factors, state.work)
+    _, _, newton, _, jacobians, factors, work = lax.while_loop(again, attempt, first)
     passes = passes_a_kink(newton, smallest, state.h != 0)
     z = jnp.where(passes & ~differential, 0, newton.x)
     found = newton._replace(x=None, converged=newton.converged | passes)
-    return z, (found, jacobians, factors, pivot, work)
+    return z, (found, jacobians, factors, work)
 
 
 def _error(step: Step, factor: Any, z: Any, tol: Tolerances) -> Float[Array, " n"]:

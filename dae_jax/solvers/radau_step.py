@@ -8,7 +8,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..compiler import is_large
 from .radau_coefficients import Coefficients, coefficients
@@ -59,6 +59,7 @@ class Factors(NamedTuple):
     real: Any
     complex: tuple[Any, ...]
     round_off: Float[Array, " n"]
+    probe: Any
 
 
 class Step(NamedTuple):
@@ -114,17 +115,25 @@ class Step(NamedTuple):
         j, m = self.linearised.jacobians(t, y, yd)
         return j, self.sign * m
 
-    def factor(self, jacobians: Any, tol: Tolerances) -> tuple[Factors, Float[Array, ""]]:
-        """The factors of γ/h M + J, in the smallest step of M/h + J, and of each (αₖ + iβₖ)/h M + J, and the smallest pivot."""
+    def factor(self, jacobians: Any, tol: Tolerances) -> Factors:
+        """The factors of γ/h M + J, in the smallest step of M/h + J, and of each (αₖ + iβₖ)/h M + J."""
         j, m = jacobians
-        real, pivot = self.linearised.factor(j, m, jnp.where(self.smallest, 1, self.method.gamma) / self.h, self.h)
+        real = self.linearised.factor(j, m, jnp.where(self.smallest, 1, self.method.gamma) / self.h, self.h)
         pairs = [lax.complex(pair.real / self.h, pair.imag / self.h) for pair in self.method.pairs]
         eliminated = lambda c: self.linearised.factor(j, m, c, self.h)
         # The elimination is the larger part of what there is to compile.
-        found = map(eliminated, pairs) if len(pairs) == 1 else _looped(eliminated, pairs)
-        both, others = zip(*found, strict=True)
+        both = map(eliminated, pairs) if len(pairs) == 1 else _looped(eliminated, pairs)
         round_off = tol.round_off(self.linearised, j, m, 1 / self.h, self.y0)
-        return Factors(real, both, round_off), functools.reduce(jnp.minimum, others, pivot)
+        return Factors(real, tuple(both), round_off, self.linearised.probe(j, m, real))
+
+    def determines(self, factors: Factors, z: Float[Array, "s n"]) -> Bool[Array, ""]:
+        """Whether the matrix that was factorised serves to solve the equations at the end of the step."""
+        t, y, yd = self.stages(z)[-1]
+        _, _, c = factors.real
+        residual = lambda x: self.linearised.residual(t, y + x, yd + self.sign * c * x)
+        return factors.probe.determines(
+            functools.partial(self.linearised.solve, factors.real), residual, jnp.zeros_like(y)
+        )
 
     def correction(self, factors: Factors, residuals: Float[Array, "s n"]) -> Float[Array, "s n"]:
         """Δz of simplified Newton, decoupled into a real and (s − 1)/2 complex systems."""
@@ -146,5 +155,5 @@ def coupled(step: Step, z: Float[Array, "s n"]) -> Any:
 def linear_solve(jacobian: Any, b: Float[Array, " sn"]) -> Float[Array, " sn"]:
     """x with A x = b for what `coupled` gives."""
     storage, matrix, scale = jacobian
-    factors, _ = storage.factor(storage.scale_columns(matrix, scale))
+    factors = storage.factor(storage.scale_columns(matrix, scale))
     return scale * storage.solve(factors, b)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from ..linalg import rms_norm, roundoff
+from ..linalg import rms_norm
 
 
 # As equinox has it.
@@ -26,6 +26,8 @@ NOISE = 0.33
 # What the first and a later correction may leave of an equation, in parts of what they change there; and what of it may be
 # round-off, in parts of its terms and of the resolution of numbers.
 FIRST_LEFT, LEFT, OFF = 0.5, 2, 1000
+# What the last correction may leave, in parts of the tolerance, as the equations are seen to have it.
+UNSOLVED = 0.03
 # Round-off of the divided differences of algebraic variables, in parts of the variables over h.
 NOISY = 1000
 # Step sizes that differ by less, relatively, are the same: their iteration matrices are.
@@ -159,10 +161,13 @@ def not_begun(start: Any, eta: Any) -> Newton:
 
 
 class Iteration(NamedTuple):
-    """F(x), the solution of A Δx = −F for the iteration matrix A at hand, and what of F may be `round_off`."""
+    """F(x), the solution of A Δx = −F for the iteration matrix A at hand, and F `combined` so that each equation says something
+    of its own where highest derivatives cancel between them; what of these may be `round_off`.
+    """
 
     residual: Callable[[Any], Any]
     correction: Callable[[Any], Any]
+    combined: Callable[[Any], Any]
     round_off: Any
 
     def next(self, x: Any) -> Any:
@@ -175,7 +180,8 @@ class Iteration(NamedTuple):
         by its slope at x (at most `allowed` of it), or right to round-off.
         """
         left, change = jax.jvp(self.residual, (x,), (dx,))
-        return left, jnp.all(jnp.abs(left) <= jnp.maximum(allowed * jnp.abs(change), self.round_off))
+        rows, changes = self.combined(left), self.combined(change)
+        return left, jnp.all(jnp.abs(rows) <= jnp.maximum(allowed * jnp.abs(changes), self.round_off))
 
 
 def simplified_newton(iteration: Iteration, start: Any, scale: Any, eta: Any, tol: Tolerances) -> Newton:
@@ -194,7 +200,8 @@ def simplified_newton(iteration: Iteration, start: Any, scale: Any, eta: Any, to
         dx = iteration.correction(off)
         x = s.x + dx
         size = rms_norm(dx * scale)
-        left, trusted = iteration.after(x, dx, jnp.where(s.count == 0, FIRST_LEFT, LEFT))
+        allowed = jnp.minimum(jnp.where(s.count == 0, FIRST_LEFT, LEFT), UNSOLVED / size)
+        left, trusted = iteration.after(x, dx, allowed)
         theta = size / jnp.maximum(s.last, jnp.finfo(start.dtype).tiny)
         first = s.count == 0
         eta = jnp.where(first, jnp.maximum(s.eta, 1e-3) ** 0.8, theta / jnp.maximum(1 - theta, epsilon))
@@ -211,14 +218,16 @@ def simplified_newton(iteration: Iteration, start: Any, scale: Any, eta: Any, to
     return lax.while_loop(goes_on, correct, (not_begun(start, eta), iteration.residual(start)))[0]
 
 
-def goes_on(tries: Any, converged: Any, fresh: Any, smallest: Any) -> Any:
-    """Whether a step is tried again: with new factors, and many times where it can be no smaller."""
-    return (tries == 0) | ~converged & (~fresh | smallest & (tries <= DAMPED + WHOLE))
+def goes_on(tries: Any, converged: Any, seen: Any, fresh: Any, smallest: Any) -> Any:
+    """Whether a step is tried again: with new factors, and many times where it can be no smaller; once it has converged with a
+    matrix that is not that of its end, with that one, which has to be `seen`: it may be singular.
+    """
+    return (tries == 0) | converged & ~seen | ~converged & (~fresh | smallest & (tries <= DAMPED + WHOLE))
 
 
-def start_of(tries: Any, predicted: Any, before: Any) -> Any:
-    """Where the next of the tries of a step starts: where the last ended, for corrections of one iteration."""
-    return jnp.where((tries <= 1) | (tries == DAMPED + 1), predicted, before)
+def start_of(tries: Any, predicted: Any, before: Newton) -> Any:
+    """Where the next of the tries of a step starts: where the last ended, if that converged, or for corrections of one iteration."""
+    return jnp.where(~before.converged & ((tries <= 1) | (tries == DAMPED + 1)), predicted, before.x)
 
 
 def corrected(
@@ -276,9 +285,9 @@ class Failure(NamedTuple):
     accurate: Any
 
 
-def of_step(found: Any, pivot: Any, size: int, error: Any) -> Failure:
-    """What went wrong, by the smallest pivot of the iteration matrix and the scaled error."""
-    return Failure(found, ~(pivot > size * roundoff(pivot.dtype)), error < 1)
+def of_step(found: Any, determined: Any, error: Any) -> Failure:
+    """What went wrong, by whether the iteration matrix determines all unknowns, without which none counts, and the scaled error."""
+    return Failure(found & determined, ~determined, error < 1)
 
 
 def is_smallest(t0: Any, t1: Any) -> Bool[Array, ""]:

@@ -31,7 +31,7 @@ def dense(storage, entries):
 
 
 def solve(storage, entries, b):
-    return storage.solve(storage.factor(entries)[0], b)
+    return storage.solve(storage.factor(entries), b)
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.complex128, np.float32])
@@ -67,9 +67,7 @@ def with_small_pivots(size, n=40):
 @pytest.mark.parametrize("size", [0.0, 1e-14, 1e-7])
 def test_small_pivots_are_left_to_partial_pivoting(size):
     storage, a = with_small_pivots(size)
-    factors, smallest = storage.factor(a)
-    assert factors[2] == (size < 1e-6)
-    assert smallest > (1e-8 if size else 0.5)
+    assert storage.factor(a)[2] == (size < 1e-6)
     b = jnp.arange(1.0, 41.0)
     found = jax.jit(lambda a, b: solve(storage, a, b))
     np.testing.assert_allclose(dense(storage, a) @ found(a, b), b, rtol=1e-8)
@@ -80,12 +78,10 @@ def test_small_pivots_are_left_to_partial_pivoting(size):
     np.testing.assert_allclose(dense(storage, with_small_pivots(5.0)[1]) @ both[1], b, rtol=1e-12)
 
 
-def test_a_singular_matrix_has_no_solution_and_the_pivot_zero():
+def test_a_singular_matrix_has_no_solution():
     storage, a, _ = example()
     for entries in (0 * a, a.at[storage.rows == 5].set(0), jnp.full_like(a, jnp.nan)):
-        factors, smallest = storage.factor(entries)
-        assert smallest == 0
-        assert jnp.isnan(storage.solve(factors, jnp.ones(storage.size))).all()
+        assert jnp.isnan(solve(storage, entries, jnp.ones(storage.size))).all()
 
 
 def test_without_our_compiler_partial_pivoting_does_it_all():
@@ -94,9 +90,8 @@ def test_without_our_compiler_partial_pivoting_does_it_all():
     storage, a, rng = example()
     b = jnp.asarray(rng.normal(size=storage.size))
     with dae_jax.configure(compiler="off"):
-        factors, smallest = storage.factor(a)
+        factors = storage.factor(a)
         assert factors[1] is None
-        assert smallest > 0.1
         np.testing.assert_allclose(dense(storage, a) @ storage.solve(factors, b), b, atol=1e-12)
 
 

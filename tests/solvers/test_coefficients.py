@@ -141,7 +141,7 @@ class TestRadau:
         form = ResidualForm.of(system, 0.0, y0, None)
         step = Step(method, LinearisedResidual.of(form, y0), 1.0, jnp.asarray(0.0), jnp.asarray(h), y0)
         tol = tolerances(1e-8, 1e-8, y0.dtype)
-        factors, _ = step.factor(step.jacobians(0.0, y0, y0), tol)
+        factors = step.factor(step.jacobians(0.0, y0, y0), tol)
         z = step.correction(factors, step.residuals(jnp.zeros((method.stages, 3))))
         stages = np.linalg.solve(
             np.kron(method.inverse / h, np.eye(3)) - np.kron(np.eye(method.stages), rates),
