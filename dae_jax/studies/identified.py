@@ -34,7 +34,7 @@ class Identified(NamedTuple):
     - `residuals`: data − model, in the structure of the data and in their units.
     - `cost`: r·r/2.
     - `iterations`: evaluations of the model with its derivatives.
-    - `offset`: how far the minimum of the linear model still is, in standard errors; 0 where the data are met to round-off.
+    - `offset`: how far the minimum of the linear model still is, in standard errors; 0 where that is round-off.
     - `sensitivities`: the lengths of the columns of J, by the logarithm of those parameters that are `in_log`: how much each shows.
     - `singular_values`: of J with its columns scaled to length 1, largest first; `combinations`: in rows, the changes that belong
       to them, times `sensitivities`.
@@ -75,7 +75,7 @@ class Identified(NamedTuple):
     @property
     def doubts(self) -> list[str]:
         """In sentences, what the data do not determine, and residuals larger than `sigma` allows."""
-        return [*_undetermined(self), *_uncertain(self), *_too_large(self)]
+        return [*_undetermined(self), *_uncertain(self), *_too_large(self), *_too_far(self)]
 
     def __repr__(self) -> str:
         """The estimate with its standard errors, in a line."""
@@ -182,4 +182,12 @@ def _too_large(found: Identified) -> Iterator[str]:
         yield (
             f"The residuals are {found.deviation:.3g} times as large as `sigma` says, which noise alone is with a probability of "
             f"{found.probability:.1g}: the model is not that of the data, or `sigma` is too small, and the standard errors with it."
+        )
+
+
+def _too_far(found: Identified) -> Iterator[str]:
+    if found.offset > 1:
+        yield (
+            f"The estimate is {found.offset:.2g} standard errors from the minimum: the noise is too small for the digits of the model, "
+            "and what it leaves uncertain is more than the standard errors say."
         )

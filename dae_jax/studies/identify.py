@@ -13,6 +13,7 @@ from jax.scipy.special import gammaincc
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ..solution import AccuracyWarning
+from ..types import DType
 from ..validate.states import NUMBERS, brief, describe
 from .identified import Identified, named
 from .least_squares import Factors, Minimum, factors, minimum
@@ -22,6 +23,11 @@ from .least_squares import Factors, Minimum, factors, minimum
 LOST = 1e-6
 # Where JAX refuses.
 ADVICE = "a `daesolve` in it needs `adjoint=diffrax.ForwardMode()`."
+# Where the model is not finite at its start.
+AT_THE_START = (
+    " So it is at the start, `params`: of a solve that failed with `throw=False`, or of a time that it did not reach, there are "
+    "no numbers."
+)
 
 
 def identify(
@@ -38,16 +44,19 @@ def identify(
 
         minimise |r|²/2,    r = (d − model(p))/σ,        covariance σ² (JᵀJ)⁻¹,    J = ∂model/∂p,
 
-    by the Levenberg–Marquardt method. J comes with the model in one pass of forward directions, one for each parameter. The
-    standard errors are those of independent normal noise of one size and of a model that is linear over them.
+    by the Levenberg–Marquardt method, with as many digits as `params` has. J comes with the model in one pass of forward
+    directions, one for each parameter. The standard errors are those of independent normal noise of one size and of a model that
+    is linear over them.
 
     **Arguments**
 
-    - `model`: a JAX function of `params` to what was measured, any pytree of arrays. A `daesolve` in it needs
-      `adjoint=diffrax.ForwardMode()`, and `throw=False` if it may fail at parameters on the way, which then are turned down. Its
-      tolerance should be small beside the noise: a derivative is as accurate as the solve.
-    - `params`: any pytree of numbers: the start.
-    - `data`: what was measured, in the structure of what `model` returns, with all numbers finite.
+    - `model`: a JAX function of `params` to what was measured, any pytree of arrays. A `daesolve` in it takes
+      `adjoint=diffrax.ForwardMode()`; with `throw=False` and `SaveAt(ts=...)` parameters on the way at which it fails are turned
+      down (by `SaveAt(t1=True)` it has the last state that it reached, which passes for the end). Its tolerance should be small
+      beside the noise: a derivative is as accurate as the solve. Its `AccuracyWarning`s are those of `model(found.params)`.
+    - `params`: any pytree of numbers: the start. What is found is the minimum that it leads to.
+    - `data`: what was measured, in the structure of what `model` returns, with all numbers finite: what is missing is left out of
+      both.
     - `sigma`: the standard deviation of the noise, a number or a pytree of them in the structure of `data` or of its upper part
       ({"angle": 0.01, "force": 2.0}). If `None`, one for all data, estimated from the residuals.
     - `positive`: whether parameters are positive, and are sought as log p, so that none becomes negative: one boolean, or some in
@@ -60,8 +69,9 @@ def identify(
     Warns by an `AccuracyWarning` of what the data do not determine, by name of the parameters or of the combination of them,
     and of residuals larger than `sigma` allows. Such parameters keep what they were at the start, along the combination.
 
-    Errors: `ValueError` for data, parameters or a model that are not finite, or not of the shape they should have; `RuntimeError`
-    where the minimum was not found. Under `jit` and `vmap` there is no warning, and NaN in place of an error: a batch of
+    Errors: `ValueError` or `TypeError` for data, parameters or a model that are not finite, not real, or not of the shape they
+    should have; `RuntimeError` where the minimum was not found, or a solve with `throw=True` failed on the way. Under `jit` and
+    `vmap` there is no warning, and NaN in place of an error: a batch of
     experiments is `jax.vmap(lambda d: identify(model, params, d))(data)`.
 
     Sources: G. A. F. Seber, C. J. Wild, *Nonlinear Regression*, ch. 2 and 3; that of the method and its end in
@@ -102,20 +112,26 @@ def _identified(
     """What was found, and whether it is no minimum."""
     p, unravel = ravel_pytree(params)
     measured, unravel_data = ravel_pytree(data)
-    weights = 1.0 if sigmas is None else 1 / ravel_pytree(sigmas)[0]
+    dtype = min((leaf.dtype for leaf in jax.tree.leaves(params)), key=lambda dtype: jnp.finfo(dtype).bits)
+    weights = jnp.ones((), dtype)
+    if sigmas is not None:
+        sigma = ravel_pytree(sigmas)[0]
+        # One that is traced is looked at here.
+        weights = jnp.where(sigma > 0, 1 / sigma, jnp.nan).astype(dtype)
     at = lambda z: unravel(jnp.where(in_log, jnp.exp(z), z).astype(p.dtype))
 
     def value_and_jacobian(z: Float[Array, " p"]) -> tuple[Array, Array]:
         def off(z: Float[Array, " p"]) -> Array:
             given = model(at(z))
             _refuse_another_shape(given, data)
-            return weights * (ravel_pytree(given)[0].astype(z.dtype) - measured)
+            _refuse_fewer_digits(given, dtype)
+            return weights * (ravel_pytree(given)[0] - measured).astype(dtype)
 
         jacobian, r = jax.jacfwd(lambda z: (off(z),) * 2, has_aux=True)(z)
         return r, jacobian
 
-    start = jnp.where(in_log, jnp.log(jnp.where(in_log, p, 1)), p).astype(jnp.result_type(float))
-    magnitude = jnp.linalg.norm(weights * measured)
+    start = jnp.where(in_log, jnp.log(jnp.where(in_log, p, 1)), p).astype(dtype)
+    magnitude = jnp.linalg.norm(weights * measured.astype(dtype))
     end = minimum(
         value_and_jacobian, start, known=sigmas is not None, magnitude=magnitude, tolerance=tolerance, steps=steps
     )
@@ -181,6 +197,10 @@ def _numbers(what: str, tree: PyTree) -> PyTree:
     for path, leaf in leaves:
         if not isinstance(leaf, NUMBERS) or jnp.iscomplexobj(leaf):
             raise TypeError(f"{_at(what, path)} must be real numbers, but holds {brief(leaf)}.")
+        if np.ma.is_masked(leaf):
+            raise TypeError(
+                f"{_at(what, path)} has a mask: leave what is masked out of the data and of what `model` returns."
+            )
         _refuse_not_finite(what, path, leaf)
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float, x)), tree)
 
@@ -200,13 +220,16 @@ def _refuse_not_finite(what: str, path: tuple[Any, ...], leaf: Any, advice: str 
 def _in_log(params: PyTree, positive: PyTree) -> Bool[np.ndarray, " p"]:
     """Which entries are sought as logarithms."""
     asked = _spread("positive", positive, params, "booleans")
+    flags = []
     for (path, p), log in zip(jax.tree_util.tree_leaves_with_path(params), jax.tree.leaves(asked), strict=True):
+        if not isinstance(log, bool | np.bool_):
+            raise TypeError(f"`positive` must hold booleans, one for each array of parameters, but holds {brief(log)}.")
         if log and not isinstance(p, Tracer) and not np.all(np.asarray(p) > 0):
             raise ValueError(
                 f"{_at('params', path)} must be positive, but holds {np.min(p):g}. Pass `positive=False`, or booleans in the "
                 "structure of `params`, for what may be negative."
             )
-    flags = [np.full(jnp.size(p), bool(log)) for p, log in zip(*map(jax.tree.leaves, (params, asked)), strict=True)]
+        flags.append(np.full(jnp.size(p), bool(log)))
     return np.concatenate(flags)
 
 
@@ -237,6 +260,18 @@ def _refuse_another_shape(given: PyTree, data: PyTree) -> None:
         raise ValueError(f"`model` must return what `data` is, {describe(data)}, but returns {describe(given)}.")
 
 
+def _refuse_fewer_digits(given: PyTree, dtype: DType) -> None:
+    for leaf in jax.tree.leaves(given):
+        kind = jnp.result_type(leaf)
+        if jnp.issubdtype(kind, jnp.complexfloating):
+            raise TypeError(f"`model` must return real numbers, but returns {describe(given)}.")
+        # Which combinations do not show is told from the digits of J.
+        if jnp.issubdtype(kind, jnp.floating) and jnp.finfo(kind).bits < jnp.finfo(dtype).bits:
+            raise TypeError(
+                f"`model` must have the digits of `params`, {dtype}, but returns {describe(given)}: pass `params` in {kind}."
+            )
+
+
 def _refuse_too_few(params: PyTree, data: PyTree, estimated: bool) -> None:
     p, m = (sum(jnp.size(x) for x in jax.tree.leaves(tree)) for tree in (params, data))
     if estimated and m <= p:
@@ -253,7 +288,7 @@ def _refuse_failure(model: Callable[[Any], Any], params: PyTree, found: Identifi
         return
     first = jax.jit(model)(params)
     for path, leaf in jax.tree_util.tree_leaves_with_path(first):
-        _refuse_not_finite("model", path, leaf, " So it is at the start, `params`.")
+        _refuse_not_finite("model", path, leaf, AT_THE_START)
     if not np.isfinite(found.cost) or not np.all(np.isfinite(found.information)):
         raise ValueError("The derivative of `model` is not finite at the start, `params`.")
     raise RuntimeError(

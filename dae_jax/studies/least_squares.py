@@ -122,8 +122,9 @@ class _LevenbergMarquardt(optimistix.AbstractGaussNewton[Point, Residual, Any]):
         distance, noise = inside / jnp.sqrt(jnp.maximum(count, 1)), 1.0 if self.known else outside
         # Data without noise are met up to round-off, which is in the tangent plane as much as anywhere.
         floor = jnp.finfo(r.dtype).eps ** (2 / 3) * jnp.maximum(self.magnitude, at.largest)
-        offset = jnp.where(inside <= floor, 0 * inside, distance / noise)
-        return offset, offset <= self.tolerance
+        met = (inside == 0) | (jnp.linalg.norm(r) <= floor) & (not self.known)
+        offset = jnp.where(met, 0 * inside, distance / noise)
+        return offset, (offset <= self.tolerance) | (inside <= floor)
 
 
 def minimum(
