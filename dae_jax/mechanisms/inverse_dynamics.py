@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
 # States may be off the constraints by this part of the largest coordinate, and velocity, of all times.
 OFF = 1e-3
+# The smallest singular value of all constraints beside the largest, in square roots of round-off: of λ it loses the square.
+NEAR = 100.0
 
 
 class _Found(NamedTuple):
@@ -77,6 +79,9 @@ def inverse_dynamics(
         free = _free(jnp.concatenate([jnp.delete(given, taken, axis=0), rolling]))
         wanted, can = -free @ (given[taken].T @ lam), free @ reach.T
         tau = jnp.linalg.lstsq(can, wanted, rcond=_half_of_the_digits(can))[0]
+        s = jnp.linalg.svd(_of_length_one(jnp.concatenate([given, rolling])), compute_uv=False)
+        independent = s[(sol.rank or len(s)) - 1] > NEAR * _half_of_the_digits(s) * s[0]
+        tau = jnp.where(independent, tau, jnp.nan)
         loads = jnp.linalg.norm(scale * ode.force(t, flat_q, flat_v))
         off = jnp.stack([jnp.max(d, initial=0) for d in violation(ode, t, (flat_q, flat_v)).distances])
         sizes = jnp.stack([jnp.max(jnp.abs(x)) for x in (flat_q, flat_v)])
@@ -130,10 +135,14 @@ def _free(rows: Float[Array, "m n"]) -> Float[Array, "n n"]:
     n = rows.shape[1]
     if not len(rows):
         return jnp.eye(n, dtype=rows.dtype)
-    lengths = jnp.linalg.norm(rows, axis=1, keepdims=True)
-    _, s, vt = jnp.linalg.svd(rows / jnp.where(lengths > 0, lengths, 1), full_matrices=False)
+    _, s, vt = jnp.linalg.svd(_of_length_one(rows), full_matrices=False)
     held = vt * (s > _half_of_the_digits(rows) * s[0])[:, None]
     return jnp.eye(n, dtype=rows.dtype) - held.T @ held
+
+
+def _of_length_one(rows: Float[Array, "m n"]) -> Float[Array, "m n"]:
+    lengths = jnp.linalg.norm(rows, axis=1, keepdims=True)
+    return rows / jnp.where(lengths > 0, lengths, 1)
 
 
 def _half_of_the_digits(x: Array) -> float:
