@@ -65,7 +65,7 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
     times_outside = (
         "A time to save at (`saveat.ts`) lies outside of t0 to t1, if only by round-off: nothing is known there. Make t1 the last "
-        "of these times."
+        "of these times. Or they are not in the order in which the solve passes them."
     )
     undefined_condition = (
         "The condition of an event is not a number (NaN) where the solve ended: an event there is not seen. Let it be defined "

@@ -95,6 +95,7 @@ def daesolve(
         with_rates(system, yd0, y0), solver, t0, t1, dt0, y0, args, formulation, saveat, stepsize_controller, adjoint, event,
         max_steps, progress_meter,
     )  # fmt: skip
+    refuse_bad_times(solve.saveat, problem.t0, problem.t1)
     program, arrays = split((solve, problem))
     before = traces()
     if any(isinstance(x, Tracer) for x in arrays):
@@ -196,7 +197,6 @@ def _run_on_numbers(program: Program, arrays: Arrays, solve: Solve, problem: Pro
     """`run`, refusing an inconsistent start in words. How many constraints are independent is found, and remembered, where it
     is not all of them.
     """
-    refuse_bad_times(solve.saveat, problem.t0, problem.t1)
     known = _of_known_rank.get(program)
     if known is None:
         known = _with_rank(program, solve, problem) if solve.formulation.counts_constraints else program

@@ -1,12 +1,13 @@
 """How a solve ended: one code for what diffrax says, what its start and end show, and what is not finite."""
 
+import functools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import diffrax
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Bool, PyTree
 
 from ..solution import RESULTS, DAESolution, all_finite, precision_of
 from ..solvers import takes_residuals
@@ -31,6 +32,10 @@ def judged(solve: "Solve", out: Sequence[PyTree], problem: Problem, found: tuple
     code = failed(RESULTS.dt_min_reached, RESULTS.step_rejected)
     code = failed(RESULTS.nonlinear_divergence, RESULTS.off_manifold)
     finite = [all_finite(*pair) for pair in _saved(solve.saveat, ts, ys)] if ts is not None else []
+    outside = [_wrong_times(part, problem) for part in saved_parts(solve.saveat) if part.ts is not None]
+    if _times_only(solve.saveat):
+        # With `throw=False` nobody need look at the code, and these would pass for states.
+        ys = jax.tree.map(functools.partial(_without, outside[0]), ys)
     precision = precision_of(t0.dtype, solve.controller)
     went_well = (code == RESULTS.successful) | (code == RESULTS.event_occurred)
     code = RESULTS.where(went_well & ~jnp.all(jnp.stack([finite_end, *finite])), RESULTS.not_finite, code)
@@ -44,7 +49,9 @@ def judged(solve: "Solve", out: Sequence[PyTree], problem: Problem, found: tuple
     stuck = jnp.any(jnp.stack([code == name for name in (*stuck, RESULTS.singular_iteration_matrix)]))
     code = RESULTS.where(stuck & end.singular, RESULTS.singular_configuration, code)
     code = RESULTS.where(went_well & ~end.near, RESULTS.off_constraints, code)
-    code = RESULTS.where(went_well & _outside(solve.saveat, problem), RESULTS.times_outside, code)
+    code = RESULTS.where(
+        went_well & jnp.any(jnp.concatenate([jnp.zeros(1, bool), *outside])), RESULTS.times_outside, code
+    )
     code = RESULTS.where(end.masses & (end.masses_ahead | went_well), code, RESULTS.irregular_mass)
     for wrong, name in enumerate(
         ("inconsistent_start", "dependent_constraints", "irregular_mass", "ambiguous_start"), 1
@@ -69,8 +76,24 @@ def _saved(saveat: diffrax.SaveAt, ts: PyTree[Array], ys: PyTree[Array]) -> list
     ]
 
 
-def _outside(saveat: diffrax.SaveAt, problem: Problem) -> Any:
-    """Whether a time to save at is beyond an end of the solve: diffrax pads it like a time that was not reached."""
+def _wrong_times(part: diffrax.SubSaveAt, problem: Problem) -> Bool[Array, " times"]:
+    """Which times to save at are beyond an end of the solve, which diffrax pads like a time that was not reached, or come after a
+    later one, to where it extrapolates.
+    """
     low, high = jnp.minimum(problem.t0, problem.t1), jnp.maximum(problem.t0, problem.t1)
-    times = [part.ts for part in saved_parts(saveat) if part.ts is not None]
-    return jnp.any(jnp.stack([jnp.any((ts < low) | (ts > high)) for ts in times])) if times else jnp.asarray(False)
+    ts = jnp.asarray(part.ts)
+    back = jnp.where(problem.t1 < problem.t0, -1, 1) * jnp.diff(ts, prepend=ts[:1]) < 0
+    return (ts < low) | (ts > high) | back
+
+
+def _times_only(saveat: diffrax.SaveAt) -> bool:
+    """Whether `SaveAt(ts=...)` is all that is saved, so that states are along `ts`."""
+    part = saveat.subs
+    return is_saved_part(part) and part.ts is not None and not (part.t0 or part.t1 or part.steps)
+
+
+def _without(wrong: Bool[Array, " times"], y: Array) -> Array:
+    """NaN in the rows that are wrong."""
+    if not jnp.issubdtype(y.dtype, jnp.inexact):
+        return y
+    return jnp.where(wrong.reshape(-1, *[1] * (y.ndim - 1)), jnp.nan, y)

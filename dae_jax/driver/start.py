@@ -66,9 +66,9 @@ def as_array(x: ArrayLike, dtype: DType) -> Any:
 
 
 def refuse_bad_times(saveat: diffrax.SaveAt, t0: Time, t1: Time) -> None:
-    """Times to save at must lie in the interval, in the order in which they are passed."""
+    """Times to save at that are known must lie in the interval, in the order in which they are passed."""
     for sub in saved_parts(saveat):
-        if sub.ts is not None:
+        if sub.ts is not None and not any(isinstance(x, Tracer) for x in (sub.ts, t0, t1)):
             ts = np.asarray(sub.ts)
             low, high = min(t0, t1), max(t0, t1)
             if ts.ndim != 1 or not np.all(np.isfinite(ts)):

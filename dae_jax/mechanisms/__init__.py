@@ -36,3 +36,4 @@ from .loads import (
 )
 from .mechanism import Mechanism as Mechanism
 from .mjcf import read_mjcf as read_mjcf
+from .paths import point_on_path as point_on_path

@@ -16,6 +16,7 @@ from . import assembly, outputs
 from .bodies import GROUND, Body, inertial_force, mass_block
 from .configuration import Configuration, Coordinates
 from .drawing import drawing
+from .inverse_dynamics import inverse_dynamics
 from .joints import AbstractJoint, Joint, pairs
 from .loads import AbstractLoad, Along, Gravity, along
 
@@ -31,7 +32,8 @@ class Mechanism(eqx.Module):
 
     - `bodies`: of `Body`.
     - `joints`: of `revolute`, `prismatic`, `cylindrical`, `spherical`, `universal`, `planar`, `fixed`, `distance`,
-      `point_on_curve`, `rolling`. Loops may be closed in any way; equations that are redundant then are found by `daesolve`.
+      `point_on_curve`, `point_on_path`, `rolling`. Loops may be closed in any way; equations that are redundant then are found by
+      `daesolve`.
     - `loads`: of `gravity`, `spring`, `damper`, `friction`, `motor`, `force`, `torque`.
 
     Errors: `ValueError` for names that occur twice or are not there, and for bodies in the plane beside ones in space.
@@ -214,6 +216,15 @@ class Mechanism(eqx.Module):
         """
         return outputs.reaction(self, sol, name, axes)
 
+    def inverse_dynamics(self, sol: DAESolution, motors: Sequence[str]) -> dict[str, Float[Array, " times"]]:
+        """The efforts by which motors on the named joints ("joint.angle" where one has several) do what leads the mechanism, in place
+        of its `point_on_path` and `motor(..., motion=...)`: torques in N m, forces in N. All other loads stay, and efforts of motors
+        that have a torque come on top. With more motors than degrees of freedom those of least norm are given.
+
+        Errors: `ValueError` where such motors cannot do it; NaN where the arguments are traced.
+        """
+        return inverse_dynamics(self, sol, motors)
+
     def drawing(self) -> Drawing:
         """Centres of mass, joints and springs as points, (points, 2) or (points, 3), and the lines between them."""
         return drawing(self)
@@ -223,8 +234,8 @@ class Mechanism(eqx.Module):
         return outputs.energy(self, sol)
 
     def power(self, sol: DAESolution) -> dict[str, Float[Array, " times"]]:
-        """What each load that has no potential, and each motor whose motion is given, puts in, in W: their sum is the derivative
-        of `energy`.
+        """What each load that has no potential, each motor whose motion is given and each path of a point puts in, in W: their sum
+        is the derivative of `energy`.
         """
         return outputs.power(self, sol)
 

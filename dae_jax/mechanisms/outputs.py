@@ -12,10 +12,11 @@ from .. import diagnostics
 from ..solution import DAESolution, without_padding
 from ..types import Args, Time
 from .bodies import GROUND, wrench
-from .configuration import Configuration, Coordinate
+from .configuration import Configuration, Coordinate, Coordinates
 from .contacts import Coupling, Motion
 from .joints import AbstractJoint
 from .loads import AbstractLoad, Along, Applied
+from .paths import LEADING
 from .rotations import moment, rotate_back
 
 
@@ -106,8 +107,19 @@ def reaction(
             return rotate_back(turn, force), rotate_back(turn, torque) if torque.ndim else torque
         return force, torque
 
-    ts, ys = without_padding(sol.ts, sol.ys)
-    return _mapped(at_one, (ts, ys, lam, mu), sol.args)
+    return at_saved_times(sol, at_one, lam, mu)
+
+
+def leading_force(mechanism: "Mechanism", sol: DAESolution, name: str) -> Float[Array, "times bodies k"]:
+    """−(∂l/∂q)ᵀ λ, the generalised force on all bodies of what leads by l(t, q) = 0."""
+    joint = next(joint for joint in mechanism.joints if joint.name == name)
+    lam = diagnostics.multipliers(mechanism.system(), sol)[..., jnp.array(mechanism.rows()[name][0], int)]
+
+    def at_one(t: Time, y: tuple[Coordinates, Coordinates], lam: Array, args: Args) -> Array:
+        _, pull = jax.vjp(lambda q: joint.constraint(t, mechanism.configuration(q), args), y[0])
+        return -pull(lam)[0].values
+
+    return at_saved_times(sol, at_one, lam)
 
 
 def energy(mechanism: "Mechanism", sol: DAESolution) -> Float[Array, " times"]:
@@ -116,7 +128,7 @@ def energy(mechanism: "Mechanism", sol: DAESolution) -> Float[Array, " times"]:
 
 
 def power(mechanism: "Mechanism", sol: DAESolution) -> dict[str, Float[Array, " times"]]:
-    """Q·v of each load without a potential, τ ċ of each motion that is given."""
+    """Q·v of each load without a potential and of what leads."""
 
     def of_load(load: AbstractLoad) -> Callable[[Time, Configuration, Args], Array]:
         def work(t: Time, at: Configuration, args: Args) -> Array:
@@ -132,18 +144,22 @@ def power(mechanism: "Mechanism", sol: DAESolution) -> dict[str, Float[Array, " 
         if load.energy(at_start) is None
     }
     for joint in mechanism.joints:
-        if isinstance(joint, Motion):
-            found[joint.name] = effort(mechanism, sol, joint.name) * rate(mechanism, sol, joint.name)
+        if isinstance(joint, LEADING):
+            work = leading_force(mechanism, sol, joint.name) * without_padding(sol.ts, sol.ys)[1][1].values
+            found[joint.name] = jnp.sum(work, (1, 2))
     return found
+
+
+def at_saved_times(sol: DAESolution, of: Callable[..., Any], *more: Array) -> Any:
+    """of(t, y, *more, args) at each saved time; `more` has these along its first axis."""
+    return _mapped(of, (*without_padding(sol.ts, sol.ys), *more), sol.args)
 
 
 def _at_saved_times(
     mechanism: "Mechanism", sol: DAESolution, of: Callable[[Time, Configuration, Args], Array]
 ) -> Float[Array, " times"]:
     """of(t, configuration, args) at each saved time."""
-    return _mapped(
-        lambda t, y, args: of(t, mechanism.configuration(*y), args), without_padding(sol.ts, sol.ys), sol.args
-    )
+    return at_saved_times(sol, lambda t, y, args: of(t, mechanism.configuration(*y), args))
 
 
 @eqx.filter_jit

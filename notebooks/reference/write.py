@@ -51,8 +51,8 @@ PAGES = {
     ),
     "studies": (
         "Studies",
-        "Many solves: sweeps, what to keep of each, tuning.",
-        "sweep grid Grid tune Tuned baumgarte_loss BaumgarteLoss reductions.*",
+        "Many solves: sweeps, what to keep of each, tuning, parameters from data.",
+        "sweep grid Grid tune Tuned identify Identified baumgarte_loss BaumgarteLoss reductions.*",
     ),
     "compiler": (
         "Compiler",

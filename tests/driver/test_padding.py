@@ -143,3 +143,21 @@ def test_a_time_beyond_the_ends_is_no_padding(beyond):
     ts = jnp.sort(jnp.array([6e-7, last]))
     assert jax.jit(solve)(ts) == (True, False)
     assert jax.jit(solve)(jnp.array([0.0, t1])) == (False, True)
+
+
+def test_a_time_that_is_out_of_order_or_before_the_start_has_no_state():
+    """With `throw=False`, and traced: else what is extrapolated passes for a state."""
+    system = dae_jax.SemiExplicitDAE(lambda t, x, z, args: -z, lambda t, x, z, args: z - x)
+
+    def solve(ts):
+        return dae_jax.daesolve(
+            system, diffrax.Tsit5(), 0.0, 1.0, None, (jnp.ones(1), jnp.ones(1)), saveat=diffrax.SaveAt(ts=ts), throw=False
+        )  # fmt: skip
+
+    for ts in ([0.0, 0.5, 0.49, 1.0], [0.0, 0.3, -0.01, 1.0]):
+        sol = jax.jit(solve)(jnp.array(ts))
+        assert sol.result == dae_jax.RESULTS.times_outside
+        assert jnp.isnan(sol.ys[0][:, 0]).tolist() == [False, False, True, False]
+    known = jnp.array([0.0, 0.5, 0.49, 1.0])
+    with pytest.raises(ValueError, match="in the order"):
+        jax.jit(lambda x: solve(known).ys[0] * x)(1.0)

@@ -155,6 +155,17 @@ def tuned() -> dae_jax.Tuned:
     )
 
 
+def identified() -> dae_jax.Identified:
+    def model(p: dict[str, Array]) -> Array:
+        return p["size"] * np.ones(5)
+
+    # Its types are to come.
+    found = dae_jax.identify(model, {"size": 1.0}, np.ones(5), 0.1)  # pyright: ignore[reportUnknownMemberType]
+    if found.doubts or found.condition > 30:
+        print(found.names, found.correlation, found.deviation)
+    return found
+
+
 def with_settings() -> None:
     with dae_jax.configure(threads=2):
         solved()
