@@ -22,6 +22,7 @@ from .equations.mechanical import MechanicalODE
 from .equations.residual_form import ResidualForm
 from .equations.structural_ode import StructuralODE
 from .formulations import AbstractFormulation
+from .linalg import SparseDefinite
 from .linalg.semidefinite import LOOPED, UNROLLED
 from .solution import precision_of
 from .solve import prepared
@@ -305,6 +306,8 @@ def _mass(system: ConstrainedSystem, mass: Float[Array, "..."] | None) -> str:
 def _linear_solver(ode: MechanicalODE, count: int) -> str:
     if isinstance(ode.linear, SparseNormals):
         gram = ode.linear.gram
+        if isinstance(gram, SparseDefinite):
+            return f"sparse elimination along the diagonal, {counted(gram.symbolic.cost, 'multiplication')}"
         return f"sparse elimination in {counted(len(gram.levels), 'level')}, {counted(gram.cost, 'multiplication')}" + (
             f", then a dense system of {gram.rest_size}" if gram.rest_size > 1 else ""
         )

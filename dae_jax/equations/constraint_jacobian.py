@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..linalg import Elimination, elimination, semidefinite_solve, take
+from ..linalg import Elimination, SparseDefinite, elimination, semidefinite_solve, take
 from ..structure import column_colouring, dependence, seed_matrix
 from ..types import Flat, Time
-from .manifold_ode import Normals
+from .manifold_ode import Normals, traced_once
 
 
 # Up to this many multiplications a product is written as a sum, which can become part of a kernel; a dot cannot.
@@ -88,8 +88,9 @@ class SparseNormals:
 
     columns: Int[np.ndarray, "colours c"]
     seeds: Float[np.ndarray, "colours n"]
-    gram: Elimination
+    gram: Elimination | SparseDefinite
 
+    @traced_once
     def at(
         self, ode: Mechanism, t: Time, q: Flat, v: Flat
     ) -> tuple[Any, Float[Array, " n"], Float[Array, "colours c"]]:
@@ -104,17 +105,20 @@ class SparseNormals:
     ) -> Float[Array, "colours c"]:
         return jax.vmap(lambda seed: jax.jvp(functools.partial(ode.constraint, t), (q,), (seed,))[1])(seeds)
 
+    @traced_once
     def along(self, ode: Mechanism, normals: Normals, x: Float[Array, " n"]) -> Float[Array, " c"]:
         """A x."""
         t, q, _ = normals
         return jax.jvp(functools.partial(ode.constraint, t), (q,), (x,))[1]
 
+    @traced_once
     def lift(self, ode: Mechanism, normals: Normals, mu: Float[Array, " c"]) -> Float[Array, " n"]:
         """M⁻¹Aᵀ μ."""
         t, q, _ = normals
         _, transpose = jax.vjp(functools.partial(ode.constraint, t), q)
         return mass_solve(ode.mass(q), transpose(mu)[0])
 
+    @traced_once
     def gram_solve(self, ode: Mechanism, normals: Normals, b: Float[Array, " c"]) -> Float[Array, " c"]:
         """x with A M⁻¹Aᵀ x = b."""
         _, q, compressed = normals
@@ -128,6 +132,7 @@ class SparseNormals:
         couplings = jnp.sum(shared * at(weighted, rows) * at(compressed, columns), 0)
         return self.gram.solve(jnp.sum(weighted * compressed, 0), couplings, b)
 
+    @traced_once
     def lengths(self, ode: Mechanism, normals: Normals) -> Float[Array, " c"]:
         """The length of each row of A."""
         t, q, compressed = normals
@@ -155,8 +160,11 @@ def _sparse_normals(pattern: bytes, shape: tuple[int, int]) -> SparseNormals:
     columns = np.full((colours.max() + 1, shape[0]), -1)
     for i, j in np.argwhere(nonzero):
         columns[colours[j], i] = j
-    gram = nonzero.astype(np.int32)
-    return SparseNormals(columns, seed_matrix(colours).T, elimination(gram @ gram.T > 0))
+    shared = nonzero.astype(np.int32)
+    gram = shared @ shared.T > 0
+    by_levels, along_the_diagonal = elimination(gram), SparseDefinite.of(gram)
+    cheaper = by_levels if by_levels.cost <= along_the_diagonal.cost else along_the_diagonal
+    return SparseNormals(columns, seed_matrix(colours).T, cheaper)
 
 
 def constraint_pattern(constraint: Callable[[Time, Flat], Array], t: Time, q: Flat) -> Bool[np.ndarray, "c n"] | None:

@@ -33,20 +33,31 @@ class Equations(Protocol):
 
 def at_one_instant(method: Callable[..., _T]) -> Callable[..., _T]:
     """Runs a method of an `eqx.Module` as scalar arithmetic where it is small, traced once for all its call sites."""
+    return traced_once(method, scalarise)
+
+
+def traced_once(method: Callable[..., _T], rewritten: Callable[..., Any] = lambda fn: fn) -> Callable[..., _T]:
+    """The same, as arrays: for what is large in any case."""
 
     @functools.wraps(method)
     def wrapped(*args: PyTree) -> Any:
         arrays, static = eqx.partition(args, eqx.is_array)
         leaves, treedef = jax.tree.flatten(static)
-        return _evaluate(method, tuple(leaves), treedef, arrays)
+        return _evaluate(method, rewritten, tuple(leaves), treedef, arrays)
 
     return wrapped
 
 
-@functools.partial(subroutine, static_argnums=(0, 1, 2))
-def _evaluate(method: Callable[..., Any], leaves: tuple[Hashable, ...], treedef: TreeDef, arrays: PyTree) -> Any:
+@functools.partial(subroutine, static_argnums=(0, 1, 2, 3))
+def _evaluate(
+    method: Callable[..., Any],
+    rewritten: Callable[..., Any],
+    leaves: tuple[Hashable, ...],
+    treedef: TreeDef,
+    arrays: PyTree,
+) -> Any:
     static = jax.tree.unflatten(treedef, leaves)
-    return scalarise(lambda arrays: method(*eqx.combine(arrays, static)))(arrays)
+    return rewritten(lambda arrays: method(*eqx.combine(arrays, static)))(arrays)
 
 
 class ManifoldODE(eqx.Module):

@@ -78,6 +78,13 @@ def in_threads(body: list[str], find_batch: list[str], width: int) -> list[str]:
     ]
 
 
+def procedure(name: str, parameters: list[str], body: list[str], longest: bool) -> list[str]:
+    """A function that kernels of its module call; `longest`: by the longest vectors."""
+    width = '"prefer-vector-width"="512" ' if longest else ""
+    head = f"define internal fastcc void {name}({', '.join(parameters)}) noinline nounwind {width}{{"
+    return [head, "entry:", *body, "ret void", "}"]
+
+
 def heap(size: int) -> tuple[list[str], list[str]]:
     """The instructions that take %heap, aligned memory of so many bytes, and those that give it back.
 

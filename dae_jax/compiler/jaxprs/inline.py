@@ -6,12 +6,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Primitive, Var, jaxpr_as_fun
 from jaxtyping import Array
 
 from ..types import Atom, Aval, Equation, Params, aval_of
 from .special_functions import SPECIAL, by_simpler_ones
-from .walk import called, of_solve
+from .walk import called, identity, of_solve
 
 
 # They give their first operand, or what is said here; others of equinox mean something to transformations only.
@@ -26,9 +26,14 @@ _SAME_IF_SO_SHAPED = frozenset({"reshape", "broadcast_in_dim", "convert_element_
 _COMMUTATIVE = frozenset({"add", "add_any", "mul", "max", "min", "and", "or", "xor", "eq", "ne"})
 
 
-def inlined(closed: ClosedJaxpr) -> ClosedJaxpr:
-    """A jaxpr that computes the same."""
-    flat = _Flat()
+# A call that stays one; its parameter `jaxpr` is the function.
+PROCEDURE = Primitive("procedure")
+PROCEDURE.multiple_results = True
+
+
+def inlined(closed: ClosedJaxpr, procedures: frozenset[Hashable] = frozenset()) -> ClosedJaxpr:
+    """A jaxpr that computes the same; functions with the identities `procedures` stay functions."""
+    flat = _Flat(procedures)
     inputs = [Var(v.aval) for v in closed.jaxpr.invars]
     outputs = flat.run(closed, inputs)
     needed, eqns = {v for v in outputs if isinstance(v, Var)}, []
@@ -42,7 +47,8 @@ def inlined(closed: ClosedJaxpr) -> ClosedJaxpr:
 
 
 class _Flat:
-    def __init__(self) -> None:
+    def __init__(self, procedures: frozenset[Hashable]) -> None:
+        self.procedures = procedures
         self.eqns: list[JaxprEqn] = []
         self.constants: dict[int, tuple[Var, Any]] = {}
         self._known: dict[Hashable, list[Any]] = {}
@@ -60,8 +66,10 @@ class _Flat:
     def _equation(self, eqn: JaxprEqn, args: list[Atom]) -> list[Any]:
         name, p = eqn.primitive.name, eqn.params
         inner = called(eqn)
-        if inner is not None:
+        if inner is not None and identity(inner) not in self.procedures:
             return self.run(inner, args)
+        if inner is not None:
+            eqn, name = eqn.replace(primitive=PROCEDURE, params={"jaxpr": inner}), PROCEDURE.name
         if name in _GIVES:
             return [args[_GIVES[name]]]
         if name in SPECIAL:

@@ -1,6 +1,6 @@
 """Jaxprs with some of their equations, at any depth, replaced by others."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import jax
@@ -10,10 +10,12 @@ from jaxtyping import Array
 
 from ..types import Arrays, Equation, Params
 from .scalar_interpreter import Unsupported
-from .walk import CALLS, WITH_DERIVATIVE, called, equations, equations_in, of_solve
+from .walk import CALLS, WITH_DERIVATIVE, called, equations, equations_in, identity, of_solve
 
 
 _CALLS = {**CALLS, **WITH_DERIVATIVE}
+# Calls that stay calls.
+_STAY = frozenset({"jit", "pjit"})
 
 
 class Rewriting:
@@ -31,6 +33,7 @@ class Rewriting:
         stops: Callable[[Arrays], Array] | None = None,
     ) -> None:
         self._applies, self._replacement, self._stops = applies, replacement, stops
+        self._known: dict[Hashable, tuple[ClosedJaxpr, ClosedJaxpr]] = {}
 
     def run(
         self, jaxpr: Jaxpr, consts: Sequence[Array], args: Sequence[Array], state: Arrays
@@ -54,6 +57,9 @@ class Rewriting:
             results = eqn.primitive.bind(*args, **eqn.primitive.get_bind_params(p))
             return results if eqn.primitive.multiple_results else [results], state
         inner = called(eqn, _CALLS)
+        if inner is not None and name in _STAY and not state:
+            found = eqn.primitive.bind(*args, **{**p, "jaxpr": self._called(inner)})
+            return found, state
         if inner is not None:
             return self.run(inner.jaxpr, inner.consts, args, state)
         match name:
@@ -69,6 +75,14 @@ class Rewriting:
                 solve = p["jaxprs"].solve
                 return self.run(solve.jaxpr, solve.consts, of_solve(p, args), state)
         raise Unsupported(f"{name} with something in it that is to be replaced")
+
+    def _called(self, closed: ClosedJaxpr) -> ClosedJaxpr:
+        """A function that is called, rewritten once for all places."""
+        key = identity(closed)
+        if key not in self._known:
+            rewritten = jax.make_jaxpr(lambda *xs: self.run(closed.jaxpr, closed.consts, xs, [])[0])(*closed.in_avals)
+            self._known[key] = closed, rewritten
+        return self._known[key][1]
 
     def _joined(self, closed: ClosedJaxpr) -> Callable[..., list[Any]]:
         n = len(closed.jaxpr.invars)

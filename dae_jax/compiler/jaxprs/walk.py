@@ -1,7 +1,7 @@
 """What is in a jaxpr."""
 
 import enum
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from typing import Any, TypeVar
 
 import jax
@@ -71,6 +71,11 @@ def called(eqn: Equation, calls: Mapping[str, str] = ALL_CALLS) -> ClosedJaxpr |
         return None
     inner = eqn.params[calls[eqn.primitive.name]]
     return inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
+
+
+def identity(closed: ClosedJaxpr) -> Hashable:
+    """What is the same of two calls of one function."""
+    return id(closed.jaxpr), *map(id, closed.consts)
 
 
 def of_solve(p: Params, args: list[T]) -> list[T]:

@@ -25,6 +25,16 @@ def store(code: Instructions, buffer: Buffer, place: Index, x: Number) -> None:
         _store(code, buffer, _part(code, buffer, place, k), part)
 
 
+def address_of(code: Instructions, buffer: Buffer, place: Index) -> str:
+    """The address of a number that is in one place for all lanes."""
+    if isinstance(place, int) and place == 0:
+        return buffer.pointer
+    place = code.times(place, 2) if buffer.parts == 2 and not buffer.plane else place
+    address, each = _address(code, buffer, place)
+    assert not each
+    return address
+
+
 def _part(code: Instructions, buffer: Buffer, place: Index, k: int) -> Any:
     """Where the k-th part of a complex number is."""
     return code.plus(place, k * buffer.plane) if buffer.plane else code.plus(code.times(place, 2), k)

@@ -40,6 +40,7 @@ class Annotated:
     - `inlined`: the jaxprs of its loops and branches without calls.
     - `cost`, `bytes`: about how many instructions it takes, and at most how many bytes its arrays, of one element.
     - `notes`: what will become of each equation.
+    - `text`: the module, where it has been written already.
     """
 
     jaxpr: ClosedJaxpr
@@ -47,6 +48,7 @@ class Annotated:
     inlined: Inlining
     notes: tuple[Note, ...]
     bytes: int
+    text: str | None = None
 
     @property
     def cost(self) -> int:

@@ -14,7 +14,7 @@ from .memory import Memory
 
 
 class Lowering(Protocol):
-    """A function that is being written: `run` writes a jaxpr, with arrays as entries (numpy arrays of objects), as views of
+    """A function that is being written: `run` writes a jaxpr, `call` a call of one, with arrays as entries (numpy arrays of objects), as views of
     memory, or yet to be computed.
     """
 
@@ -22,6 +22,7 @@ class Lowering(Protocol):
     memory: Memory
 
     def run(self, closed: ClosedJaxpr, args: list[Operand]) -> list[Operand]: ...
+    def call(self, closed: ClosedJaxpr, args: list[Operand]) -> list[Operand]: ...
     def equation(self, eqn: Equation, args: list[Operand]) -> list[Operand]: ...
     def constant(self, x: ArrayLike) -> Operand: ...
 
@@ -29,7 +30,7 @@ class Lowering(Protocol):
 class Context:
     """An equation, and the function that its instructions are written into.
 
-    - `code`, `memory`, `run`: what instructions, arrays and inner jaxprs are written with.
+    - `code`, `memory`, `run`, `call`: what instructions, arrays, inner jaxprs and procedures are written with.
     - `large`: whether the operands may be in memory and the result shall be; else the operands are entries in registers.
     - `out`, `outs`, `to`: the aval of the result, of all results, and the result's type of number.
     - `dtype`, `dtypes`: the type of the last operand, and of each.
@@ -39,6 +40,7 @@ class Context:
         self.code: Instructions = lowering.code
         self.memory: Memory = lowering.memory
         self.run: Callable[[ClosedJaxpr, list[Operand]], list[Operand]] = lowering.run
+        self.call: Callable[[ClosedJaxpr, list[Operand]], list[Operand]] = lowering.call
         self.eqn, self.name, self.large = eqn, eqn.primitive.name, large
         self.outs = [v.aval for v in eqn.outvars]
         self.dtypes = [np.dtype(v.aval.dtype) for v in eqn.invars]

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from typing import Any
 
 from jax.extend.core import ClosedJaxpr, Literal, Var
@@ -44,6 +44,7 @@ class _Estimate:
         self.inlined, self.lanes = inlined, width > 1
         self.few = THRESHOLDS.few if width == 1 else THRESHOLDS.carried
         self.notes: list[Note] = []
+        self._procedures: dict[Hashable, list[_State]] = {}
         self.bytes = 0
 
     def loaded(self, aval: Aval, varying: bool) -> _State:
@@ -100,6 +101,11 @@ class _Estimate:
             n, m = p["cond_nconsts"], p["body_nconsts"]
             self.run(self.inlined(p["cond_jaxpr"]), [*args[:n], *outs], depth, times)
             self.run(self.inlined(p["body_jaxpr"]), [*args[n : n + m], *outs], depth, times)
+        elif eqn.primitive.name == "procedure":
+            form = id(p["jaxpr"].jaxpr), tuple(args)
+            if form not in self._procedures:
+                self._procedures[form] = self.run(self.inlined(p["jaxpr"]), args, depth, 1)
+            outs = self._procedures[form]
         elif eqn.primitive.name == "scan":
             n, m, body = p["num_consts"], p["num_carry"], p["jaxpr"]
             turns = p["length"] if is_written_out(eqn) else 1

@@ -1,6 +1,6 @@
 """The jaxprs in a function without their calls, each inlined once."""
 
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 
 from jax.extend.core import ClosedJaxpr
 
@@ -10,14 +10,15 @@ from ..types import Equation
 
 
 class Inlining:
-    """Jaxprs without calls, by the jaxprs that they come from."""
+    """Jaxprs without calls but those of procedures, by the jaxprs that they come from."""
 
-    def __init__(self) -> None:
+    def __init__(self, procedures: frozenset[Hashable] = frozenset()) -> None:
+        self._procedures = procedures
         self._known: dict[int, tuple[ClosedJaxpr, ClosedJaxpr]] = {}
 
     def __call__(self, closed: ClosedJaxpr) -> ClosedJaxpr:
         if id(closed) not in self._known:
-            self._known[id(closed)] = closed, inlined(closed)
+            self._known[id(closed)] = closed, inlined(closed, self._procedures)
         return self._known[id(closed)][1]
 
 

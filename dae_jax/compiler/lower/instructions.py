@@ -41,8 +41,9 @@ Index: TypeAlias = Value | int
 class Instructions:
     """A function's instructions, written one after another; `mask` says which lanes take part, all where it is `None`."""
 
-    def __init__(self, width: int = 1) -> None:
+    def __init__(self, width: int = 1, prefix: str = "") -> None:
         self.width = width
+        self._prefix = f"{prefix}v"
         self.mask: Value | None = None
         self.lines: list[str] = []
         self.declared: dict[str, str] = {}
@@ -58,7 +59,7 @@ class Instructions:
 
     def name(self) -> str:
         self._count += 1
-        return f"v{self._count}"
+        return f"{self._prefix}{self._count}"
 
     def type(self, kind: str, lanes: bool) -> str:
         return f"<{self.width} x {kind}>" if lanes else kind

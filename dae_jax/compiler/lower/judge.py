@@ -1,5 +1,6 @@
 """Whether a function can be compiled, and to what: found before an instruction is written, by the only judge."""
 
+import dataclasses
 import functools
 from collections.abc import Iterator
 
@@ -19,6 +20,7 @@ from .inlining import Inlining, inner
 from .lowering import TooLarge
 from .module_text import module_text
 from .registry import RULES, named, quoted
+from .repeated import repeated
 
 
 def annotate(jaxpr: ClosedJaxpr, batched: tuple[bool, ...] = ()) -> Annotated | Unsupported:
@@ -40,13 +42,16 @@ def unsupported(jaxpr: ClosedJaxpr, batched: tuple[bool, ...] = ()) -> tuple[Uns
 
 @functools.lru_cache(maxsize=4)
 def _annotated(jaxpr: ClosedJaxpr, batched: tuple[bool, ...], _: Target) -> Annotated | Unsupported:
-    inlined = Inlining()
-    flat = inlined(without_keys(jaxpr))
-    found = next(_unsupported(flat, inlined), None)
+    whole, inlined = without_keys(jaxpr), Inlining()
+    found = next(_unsupported(inlined(whole), inlined), None)
     if found is not None:
         return found
-    annotated = estimate.annotated(flat, batched, inlined)
-    return _too_large(annotated) or annotated
+    annotated = estimate.annotated(inlined(whole), batched, inlined)
+    if annotated.cost > THRESHOLDS.whole:
+        # Not where the whole is small enough: a function is faster by a fifth as a part of its surroundings.
+        inlined = Inlining(repeated(whole))
+        annotated = estimate.annotated(inlined(whole), batched, inlined)
+    return _unless_too_large(annotated)
 
 
 def _unsupported(jaxpr: ClosedJaxpr, inlined: Inlining) -> Iterator[Unsupported]:
@@ -77,8 +82,8 @@ def _reason(eqn: Equation) -> str | None:
     return RULES[name].unsupported(eqn) if name in RULES else f"`{name}` has no rule"
 
 
-def _too_large(annotated: Annotated) -> Unsupported | None:
-    """Why it is too large. Where the estimates do not settle it, it is written to see."""
+def _unless_too_large(annotated: Annotated) -> Annotated | Unsupported:
+    """The function, or why it is too large. Where the estimates do not settle it, it is written to see."""
     cost, limit = annotated.cost, THRESHOLDS.instructions
     reason = f"it takes more than {limit} instructions, or {THRESHOLDS.heap_bytes} bytes, which is slow to compile"
     refused = Unsupported(reason, primitive="size")
@@ -86,9 +91,8 @@ def _too_large(annotated: Annotated) -> Unsupported | None:
         return refused
     # With arrays that are copied, and those of loops and branches.
     if cost <= limit and 3 * annotated.bytes * annotated.width <= THRESHOLDS.heap_bytes:
-        return None
+        return annotated
     try:
-        module_text(annotated, limit=limit)
+        return dataclasses.replace(annotated, text=module_text(annotated, limit=limit))
     except TooLarge:
         return refused
-    return None

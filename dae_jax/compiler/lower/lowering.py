@@ -9,14 +9,16 @@ from jax.typing import ArrayLike
 from ..jaxprs.numbers import on_numbers
 from ..jaxprs.objects import is_number, objects
 from ..thresholds import THRESHOLDS
-from ..types import Equation
+from ..types import Aval, Equation
 from . import rules as rules
-from .arrays import Operand
+from .arrays import Buffer, Operand, View, row_major
 from .context import Context
+from .dtypes import parts_of
 from .environment import Environment
 from .inlining import Inlining
 from .instructions import Instructions
 from .memory import Memory
+from .procedures import Procedures
 from .registry import RULES, Rule, quoted
 
 
@@ -34,16 +36,44 @@ class Lowering:
     An entry that is known is a numpy scalar. `limit`: after how many instructions it is given up with `TooLarge`.
     """
 
-    def __init__(self, width: int, always_copies: bool, limit: float, inlined: Inlining) -> None:
-        self.code = Instructions(width)
+    def __init__(self, width: int, always_copies: bool, limit: float, inlined: Inlining, prefix: str = "") -> None:
+        self.code = Instructions(width, prefix)
         self.memory = Memory(self.code, always_copies)
-        self._limit, self._inlined = limit, inlined
+        self.procedures = Procedures()
+        self.inlined = inlined
+        self._limit = limit
+        # Arguments of the kernel that are the same for all lanes, with their places.
+        self._arguments: dict[int, tuple[int, Operand]] = {}
+
+    def within(self, prefix: str) -> "Lowering":
+        """A procedure of the same module, whose names begin so."""
+        inner = Lowering(self.code.width, self.memory.always_copies, self._limit, self.inlined, prefix)
+        inner.procedures, inner.code.declared = self.procedures, self.code.declared
+        inner.memory.constants = self.memory.constants
+        return inner
 
     def run(self, closed: ClosedJaxpr, args: list[Operand]) -> list[Any]:
         """Writes a jaxpr; gives its results."""
-        environment = Environment(self, self._inlined(closed), args)
+        environment = Environment(self, self.inlined(closed), args)
         environment.advance(0, len(environment.jaxpr.eqns))
         return environment.results()
+
+    def argument(self, place: int, aval: Aval) -> Operand:
+        """An argument of the kernel that is the same for all lanes."""
+        kind, parts = parts_of(aval.dtype)
+        buffer = Buffer(f"%arg{place}", kind, False, writable=False, parts=parts)
+        view = View(np.dtype(aval.dtype), aval.shape, buffer, row_major(aval.shape))
+        x = view if view.size > THRESHOLDS.carried else self.memory.entries(view)
+        self._arguments[id(x)] = place, x
+        return x
+
+    def place_of(self, x: Operand) -> int:
+        """Which argument of the kernel this is; −1 if none."""
+        return self._arguments.get(id(x), (-1, x))[0]
+
+    def call(self, closed: ClosedJaxpr, args: list[Operand]) -> list[Any]:
+        """Writes a call of a procedure; gives its results."""
+        return self.procedures.call(self, closed, args)
 
     def constant(self, x: ArrayLike) -> Any:
         """Known numbers; many of them are data of the module."""
@@ -65,7 +95,7 @@ class Lowering:
             raise
         except Exception as error:
             raise LoweringError(f"The rule of `{eqn.primitive.name}` failed at {quoted(eqn)}: {error!r}") from error
-        if len(self.code.lines) > self._limit:
+        if len(self.code.lines) + len(self.procedures.lines) > self._limit:
             raise TooLarge
         return out
 

@@ -30,7 +30,7 @@ def _written(jaxpr: ClosedJaxpr, batched: tuple[bool, ...], always_copies: bool,
     annotated = annotate(jaxpr, batched)
     if isinstance(annotated, Unsupported):
         raise annotated
-    return module_text(annotated, always_copies)
+    return module_text(annotated, always_copies) if always_copies or annotated.text is None else annotated.text
 
 
 def compiled(jaxpr: ClosedJaxpr, batched: Sequence[bool] = (), always_copies: bool = False) -> Callable[..., list[Any]]:

@@ -59,7 +59,7 @@ class _Module:
             if lanes
             else alone(body, code.longest >= THRESHOLDS.long_loop)
         )
-        return "\n".join([*memory.constants, *code.declared.values(), *functions])
+        return "\n".join([*memory.constants, *code.declared.values(), *self.lowering.procedures.lines, *functions])
 
     def _find_batch(self) -> list[str]:
         """The instructions that find the size of the batch."""
@@ -82,7 +82,10 @@ class _Module:
         """The arguments, of the element that each lane has."""
         args = []
         for k, (v, batched) in enumerate(zip(self.jaxpr.jaxpr.invars, self.batched, strict=True)):
-            x = self._view(f"%arg{k}", v.aval, row if batched else None, writable=False)
+            if not batched:
+                args.append(self.lowering.argument(k, v.aval))
+                continue
+            x = self._view(f"%arg{k}", v.aval, row, writable=False)
             args.append(x if x.size > THRESHOLDS.carried else self.memory.entries(x))
         return args
 

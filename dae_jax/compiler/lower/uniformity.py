@@ -31,7 +31,7 @@ def varying(jaxpr: ClosedJaxpr | Jaxpr, inputs: Sequence[bool], in_memory: bool 
 def results(eqn: Equation, args: list[bool], in_memory: bool = True) -> list[bool]:
     """For each result of an equation whether it may."""
     name, p, n = eqn.primitive.name, eqn.params, len(eqn.outvars)
-    inner = called(eqn)
+    inner = p["jaxpr"] if name == "procedure" else called(eqn)
     if inner is not None:
         return varying(inner, args, in_memory)
     if name == "while":

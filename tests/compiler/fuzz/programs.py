@@ -72,6 +72,16 @@ def _in_vmap(fn: Any, k: Any, xs: Any) -> Any:
     return jax.vmap(fn)(*(jnp.stack([x, _turned(x)]) for x in xs)) if xs else fn()
 
 
+def called_twice(program: "Program") -> "Program":
+    """The same, and the same of operands in another order, by one function."""
+    call = jax.jit(lambda *xs: tuple(program.fn(*xs)))
+
+    def fn(*xs: Any) -> list[Any]:
+        return [*call(*xs), *call(*map(_turned, xs[:-1]), xs[-1])]
+
+    return dataclasses.replace(program, name=f"{program.name} twice", fn=fn)
+
+
 NESTS = {"scan": _in_scan, "while": _in_while, "cond": _in_cond, "switch": _in_switch, "vmap": _in_vmap}
 
 

@@ -3,6 +3,7 @@
 from . import (
     bits as bits,
     branches as branches,
+    calls as calls,
     contractions as contractions,
     elementwise as elementwise,
     floats as floats,
