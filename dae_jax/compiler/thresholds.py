@@ -36,7 +36,8 @@ class Thresholds:
     - `overestimate`: the estimate counts up to this many instructions for each that is written, since it knows of no zeros and of
       nothing that is there twice. In between the function is written to see.
     - `whole`, `procedure`: in a program of more than `whole` instructions a function that is called at several places is a
-      procedure if it has more than `procedure`. A Stewart platform takes 180,000 instructions in place of 350,000: ready in 16 s, 1.5 ms a step; by XLA in 25 s, 3.4.
+      procedure if it has more than `procedure`. A Stewart platform takes 180,000 instructions in place of 350,000: ready in 16 s,
+      1.5 ms a step; by XLA in 25 s, 3.4 ms.
     - `loop_cost`: a loop over an array takes about as many instructions as this many entries do.
     """
 

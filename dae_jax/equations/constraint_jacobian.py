@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..linalg import Elimination, SparseDefinite, elimination, semidefinite_solve, take
+from ..linalg.semidefinite import LOOPED
 from ..structure import column_colouring, dependence, seed_matrix
 from ..types import Flat, Time
 from .manifold_ode import Normals, traced_once
@@ -162,9 +163,11 @@ def _sparse_normals(pattern: bytes, shape: tuple[int, int]) -> SparseNormals:
         columns[colours[j], i] = j
     shared = nonzero.astype(np.int32)
     gram = shared @ shared.T > 0
-    by_levels, along_the_diagonal = elimination(gram), SparseDefinite.of(gram)
-    cheaper = by_levels if by_levels.cost <= along_the_diagonal.cost else along_the_diagonal
-    return SparseNormals(columns, seed_matrix(colours).T, cheaper)
+    order: Elimination | SparseDefinite = elimination(gram)
+    # What would be left to LAPACK.
+    if order.rest_size > LOOPED and SparseDefinite.of(gram).cost < order.cost:
+        order = SparseDefinite.of(gram)
+    return SparseNormals(columns, seed_matrix(colours).T, order)
 
 
 def constraint_pattern(constraint: Callable[[Time, Flat], Array], t: Time, q: Flat) -> Bool[np.ndarray, "c n"] | None:

@@ -82,7 +82,7 @@ def test_nothing_is_written_in_place_that_is_needed():
 def test_arrays_of_a_procedure_that_the_stack_is_too_small_for():
     @jax.jit
     def large(x):
-        grid = jnp.sin(jnp.arange(400.0) * x)
+        grid = jnp.sin(jnp.linspace(0.0, 3.0, 400) * x)
         return jnp.cumsum(grid)[::-1] + jax.lax.fori_loop(0, 3, lambda i, g: g + jnp.roll(g, 1) / 2, grid)
 
     fn = lambda x: large(x) + large(x + 1) * large(jnp.sin(large(x)[0]))

@@ -14,8 +14,8 @@ from .memory import Memory
 
 
 class Lowering(Protocol):
-    """A function that is being written: `run` writes a jaxpr, `call` a call of one, with arrays as entries (numpy arrays of objects), as views of
-    memory, or yet to be computed.
+    """A function that is being written: `run` writes a jaxpr, `call` a call of one, with arrays as entries (numpy arrays of
+    objects), as views of memory, or yet to be computed.
     """
 
     code: Instructions
