@@ -76,11 +76,8 @@ class Procedures:
         """Writes a call, and the procedure where there is none yet of this form; gives its results."""
         code, memory = caller.code, caller.memory
         temporary: list[Buffer] = []
-        handed = {
-            k: _handed(caller, args[k], v.aval, temporary)
-            for k, v in enumerate(closed.jaxpr.invars)
-            if k in _used(caller.inlined(closed))
-        }
+        avals = [v.aval for v in closed.jaxpr.invars]
+        handed = {k: _handed(caller, args[k], avals[k], temporary) for k in _used(caller.inlined(closed))}
         form = identity(closed), *(each.form for each in handed.values()), code.mask is None
         if form not in self._known:
             self._known[form] = closed, self._written(caller, closed, handed)
@@ -147,11 +144,11 @@ class Procedures:
         return _Procedure(name, results, memory.heap)
 
 
-def _used(inlined: ClosedJaxpr) -> set[int]:
+def _used(inlined: ClosedJaxpr) -> list[int]:
     """Which arguments a function without calls reads."""
     read = {v for eqn in inlined.jaxpr.eqns for v in eqn.invars if isinstance(v, Var)}
     read.update(v for v in inlined.jaxpr.outvars if isinstance(v, Var))
-    return {k for k, v in enumerate(inlined.jaxpr.invars) if v in read}
+    return [k for k, v in enumerate(inlined.jaxpr.invars) if v in read]
 
 
 def _handed(caller: "Lowering", x: Operand, aval: Aval, temporary: list[Buffer]) -> _Argument:
