@@ -22,7 +22,7 @@ PARTS = 4
 # What a rule declares and no recipe asks for: JAX has it not, it is what programs are nested in, or another operand's type.
 NOT_ASKED_FOR = {
     "abs": UNSIGNED,
-    "cond": ALL, "scan": ALL, "while": ALL,
+    "cond": ALL, "procedure": ALL, "scan": ALL, "while": ALL,
     "pow": INTEGERS,
     **dict.fromkeys("cummax cummin reduce_prod reduce_sum scatter-add scatter-max scatter-min".split(), BOOL),
 }  # fmt: skip
