@@ -218,7 +218,7 @@ def analyse(system: System, t0: Time, y0: State, args: Args = None) -> Structure
     variables that have too few equations.
     """
     refuse_wrong_state(system, y0)
-    system = current(system)
+    system, args = current((system, args))
     y0 = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
     refuse_wrong_functions(system, t0, y0, args)
     form = ResidualForm.of(system, t0, y0, args)

@@ -1,6 +1,7 @@
 """Consistent initial states: how far a state is off, and the nearest one that is not."""
 
-from typing import Any
+import operator
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,7 +14,7 @@ from .equations.constraint_jacobian import Rank, mass_solve
 from .equations.initial_rates import is_nonlinear, rates_of
 from .equations.linearised import LinearisedResidual
 from .equations.mechanical import MechanicalODE
-from .equations.regularity import has_rank, is_near_constraints, mass_is_regular, weakest
+from .equations.regularity import DRIFTED, LARGE, has_rank, is_near_constraints, mass_is_regular, weakest
 from .equations.residual_form import ResidualForm
 from .equations.structural_ode import StructuralODE
 from .linalg import fixed_point, implicit_root, relative_change
@@ -85,6 +86,11 @@ class Unsolved(eqx.Module):
         """Whether every equation has a solution; false for NaN."""
         return jnp.all(jnp.abs(self.residuals) <= self.allowed)
 
+    def as_part(self) -> Float[Array, ""]:
+        """By which part of the state the worst equation is off."""
+        off = jnp.abs(self.residuals) / jnp.where(self.allowed > 0, self.allowed, 1)
+        return jnp.finfo(off.dtype).eps ** 0.5 * jnp.max(off, initial=0)
+
     def message(self) -> str:
         """Which equations are off, and by how much."""
         residuals, allowed = np.abs(np.asarray(self.residuals)), np.asarray(self.allowed)
@@ -120,29 +126,20 @@ def _left_over(ode: StructuralODE, t: Time, y: Float[Array, " N"]) -> Unsolved:
     return Unsolved(ode.violations(t, y), jnp.finfo(y.dtype).eps ** 0.5 * terms, ode.invariant_names)
 
 
-def look_at_start(
-    system: System, t: Time, state: State, args: Args, rank: int | Rank | None, invertible: bool
-) -> tuple[Int[Array, ""], Bool[Array, ""]]:
+class Start(NamedTuple):
     """What is wrong with a start: 0 for nothing, 1: it is inconsistent, 2: the constraints have not the given rank (`None`:
     all are independent), 3: the masses, 4: several ẏ satisfy the equations; and whether nothing is wrong beyond doubt.
-    `invertible`: whether M must be.
     """
-    if not is_mechanism(system):
-        left = unsolved(system, t, state, args)
-        consistent = left.consistent()
-        return jnp.where(consistent, jnp.where(left.several, 4, 0), 1), consistent & ~left.several
-    ode = MechanicalODE.of(system, t, state, args, rank)
-    y = ode.encode(state)
-    consistent, regular = violation(ode, t, y).consistent(), mass_is_regular(ode, y[0], invertible)
-    fits, surely = has_rank(ode, t, y, ode.rank)
-    wrong = jnp.where(regular, jnp.where(consistent, jnp.where(fits, 0, 2), 1), 3)
-    return wrong, (wrong == 0) & surely
+
+    wrong: Int[Array, ""]
+    surely: Bool[Array, ""]
 
 
-class End(eqx.Module):
-    """What a mechanism's state at the end of a solve says: whether it satisfies the constraints (see `is_near_constraints`)
-    and these nearly depend on each other; whether the masses are regular there, and also beyond, where a solve that failed
-    did not get. `drifted`: whether it is off the constraints by more than the tolerances.
+class End(NamedTuple):
+    """What the state at the end of a solve says: whether it satisfies the equations as far as to have any meaning (see
+    `is_near_constraints`); of a mechanism, whether constraints nearly depend on each other; whether the masses are regular
+    there, and also beyond, where a solve that failed did not get. `drifted`: whether it is off the equations by more than the
+    tolerances.
     """
 
     near: Bool[Array, ""]
@@ -152,7 +149,7 @@ class End(eqx.Module):
     drifted: Bool[Array, ""]
 
 
-def look_at_end(
+def look(
     system: System,
     t0: Time,
     start: State,
@@ -163,21 +160,42 @@ def look_at_end(
     keeps: tuple[bool, bool],
     tolerances: tuple[Time, Time],
     residual: bool,
-) -> End:
-    """The state (t, y) at the `end` of a solve."""
-    yes = jnp.asarray(True)
+) -> tuple[Start, End]:
+    """The start and the `end` (t, y) of a solve. `invertible`: whether M must be."""
     if not is_mechanism(system):
-        return End(yes, ~yes, yes, yes, ~yes)
+        return _look_at_equations(system, t0, start, args, end, tolerances)
     ode = MechanicalODE.of(system, t0, start, args, rank)
-    start, (t, end) = ode.encode(start), (end[0], ode.encode(end[1]))
-    near, drifted = is_near_constraints(ode, t, start, end, keeps, tolerances, residual)
-    singular = ~yes if ode.rank else weakest(ode, t, end) < jnp.finfo(t.dtype).eps ** SINGULAR
+    y, (t, y_end) = ode.encode(start), (end[0], ode.encode(end[1]))
+    consistent, regular = violation(ode, t0, y).consistent(), mass_is_regular(ode, y[0], invertible)
+    fits, surely = has_rank(ode, t0, y, ode.rank)
+    wrong = jnp.where(regular, jnp.where(consistent, jnp.where(fits, 0, 2), 1), 3)
+    at_start = Start(wrong, (wrong == 0) & surely)
+
+    near, drifted = is_near_constraints(ode, t, y, y_end, keeps, tolerances, residual)
+    yes = jnp.asarray(True)
+    singular = ~yes if ode.rank else weakest(ode, t, y_end) < jnp.finfo(t.dtype).eps ** SINGULAR
     if not callable(system.mass):
-        return End(near, singular, yes, yes, drifted)
-    (q, v), finite = end, jnp.all(jnp.isfinite(end[0]))
+        return at_start, End(near, singular, yes, yes, drifted)
+    (q, v), finite = y_end, jnp.all(jnp.isfinite(y_end[0]))
     regular = lambda q: mass_is_regular(ode, q, invertible) | ~finite
     ahead = [regular(q + AHEAD**k * (t - t0) * v) for k in (1, 2, 3)]
-    return End(near, singular, regular(q), ahead[0] & ahead[1] & ahead[2], drifted)
+    return at_start, End(near, singular, regular(q), ahead[0] & ahead[1] & ahead[2], drifted)
+
+
+def _look_at_equations(
+    system: System, t0: Time, start: State, args: Args, end: tuple[Scalar, State], tolerances: tuple[Time, Time]
+) -> tuple[Start, End]:
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(end)]))
+    both = jax.tree.map(lambda a, b: jnp.stack([a, jnp.where(finite, b, a)]), (jnp.asarray(t0), start), end)
+    # One after the other, so that it is compiled once.
+    left = jax.lax.map(lambda at: unsolved(system, at[0], at[1], args), both)
+    at_start, at_end = (jax.tree.map(operator.itemgetter(k), left) for k in (0, 1))
+    consistent, off = at_start.consistent(), at_end.as_part()
+    wrong = jnp.where(consistent, jnp.where(at_start.several, 4, 0), 1)
+    rtol, atol = tolerances
+    drifted = (off > jnp.finfo(off.dtype).eps ** 0.5 + DRIFTED * (rtol + atol)) & (rtol + atol > 0)
+    no = jnp.asarray(False)
+    return Start(wrong, wrong == 0), End(~(off > LARGE), no, ~no, ~no, drifted)
 
 
 def consistent_state(
@@ -208,7 +226,7 @@ def consistent_state(
     arguments are traced; `NotImplementedError` for its derivative where it has more than 256 unknowns and hidden equations.
     """
     refuse_wrong_state(system, y0)
-    system = current(with_rates(system, yd0, y0))
+    system, args = current((with_rates(system, yd0, y0), args))
     y0 = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
     refuse_wrong_functions(system, t0, y0, args)
     masks = jax.tree.map(lambda x: jnp.zeros_like(x, dtype=bool), y0)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from .equations.constraint_jacobian import Rank, dense_mass
 from .equations.mechanical import MechanicalODE
 from .equations.residual_drift import EquationDrift, equation_drift
-from .solution import DAESolution, without_padding
+from .solution import DAESolution, at_saved_times
 from .systems import ConstrainedSystem, ImplicitDAE, SemiExplicitDAE, System, is_mechanism
 from .types import Args, State, Time
 from .validate.captured import current
@@ -119,7 +119,7 @@ def multipliers(system: ConstrainedSystem, *at: Any) -> Any:
         return _at_saved_times(system, sol, lambda t, y, args: _multipliers(system, t, y, args, sol.rank))
     if len(at) not in (3, 4):
         raise TypeError("`multipliers` takes (system, sol) or (system, t, q, v, args).")
-    t, q, v, *args = at
+    t, q, v, *args = current(at)
     state = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), (q, v))
     refuse_wrong_state(system, state)
     found = _multipliers(system, t, state, args[0] if args else None, system.rank)
@@ -148,13 +148,13 @@ def _at_saved_times(system: System, sol: DAESolution, of: Callable[..., Any]) ->
             "parts take one, `dataclasses.replace(sol, ts=sol.ts[0], ys=sol.ys[0])`."
         )
 
-    def along(ts: Float[Array, "*batch times"], ys: State, args: Args) -> Any:
+    def along(ts: Float[Array, "*batch times"], ys: State, args: Args, changed: Args) -> Any:
         if ts.ndim > 1:
-            return eqx.filter_vmap(along)(ts, ys, args)
+            return eqx.filter_vmap(along)(ts, ys, args, changed)
         _refuse_no_states(system, ts, ys, args)
-        return jax.vmap(lambda t, y: of(t, y, args))(*without_padding(ts, ys))
+        return at_saved_times(of, ts, ys, args, changed)
 
-    return along(sol.ts, sol.ys, sol.args)
+    return along(sol.ts, sol.ys, sol.args, sol.changed)
 
 
 def _refuse_no_states(system: System, ts: Float[Array, "*batch times"], ys: State, args: Args) -> None:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Real
 
 from ._compat import messages
 from .tables import table
-from .types import DType, State, Time
+from .types import Args, DType, State, Time
 
 
 # What shows a solution lies on a floor above: the package registers it here, by name.
@@ -70,6 +70,10 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     undefined_condition = (
         "The condition of an event is not a number (NaN) where the solve ended: an event there is not seen. Let it be defined "
         "on either side of its zero."
+    )
+    event_not_located = (
+        "An event occurred, and its root finder did not find out when: it starts at the end of the step, from where Newton's method "
+        "may lead away. Use `diffrax.Event(condition, optimistix.Bisection(rtol, atol, flip='detect'))`."
     )
     step_rejected = (
         "The step size went to the resolution of time: at the last time reached the force is not finite, the "
@@ -136,6 +140,8 @@ class DAESolution(eqx.Module):
       large), 4 (very many steps) and 8 (a singular configuration was passed).
     - `result`: a `RESULTS` code, with its message.
     - `event_mask`: which event ended the solve, if any.
+    - `args`: as given; `changed`: what the resets of a `Reset` have changed of them, in their structure, as it holds at each saved time
+      (a leading axis), `None` for the rest.
     - `rank`: how many constraints are independent, where some are redundant, else `None`.
     - `precision`: with how many digits it was computed, and the tolerances: "float32, rtol 1e-05, atol 1e-05".
     """
@@ -151,6 +157,7 @@ class DAESolution(eqx.Module):
     args: Any = None
     rank: int | None = eqx.field(static=True, default=None)
     precision: str = eqx.field(static=True, default="")
+    changed: Any = None
 
     @property
     def final(self) -> Any:
@@ -235,6 +242,14 @@ def without_padding(ts: Float[Array, "*batch times"], ys: State) -> tuple[Any, A
     last = jnp.maximum(jnp.sum(jnp.isfinite(ts)) - 1, 0)
     at = jnp.minimum(jnp.arange(ts.shape[0]), last)
     return ts[at], jax.tree.map(lambda y: y[at], ys)
+
+
+def at_saved_times(
+    of: Callable[..., Any], ts: Float[Array, "*batch times"], ys: State, args: Args, changed: Args, *more: Array
+) -> Any:
+    """of(t, y, *more, args) at each saved time of a solution; `more` has these along its first axis."""
+    ts, (ys, changed) = without_padding(ts, (ys, changed))
+    return jax.vmap(lambda t, y, c, *more: of(t, y, *more, eqx.combine(c, args)))(ts, ys, changed, *more)
 
 
 def all_finite(ts: Float[Array, "*batch times"], ys: State) -> Any:

@@ -63,8 +63,8 @@ def daesolve(
     **Arguments**
 
     - `system`: the equations. What their functions take from around them (globals, closures, defaults, attributes, containers) is
-      looked at in each call, and a change is seen; only containers of more than 2,000 entries that are changed in place are not
-      looked into, nor objects of other libraries, nor objects in `args` that are no pytrees. Hand over as `args` what changes often,
+      looked at in each call, and a change is seen, also one of an object in `args`; only containers of more than 2,000 containers or
+      objects that are changed in place are not looked into, nor objects of other libraries. Hand over as `args` what changes often,
       as numbers and arrays: that compiles nothing anew.
     - `solver`: any diffrax solver, or one that keeps its steps on the constraints (`OrthogonalProjection`,
       `SymmetricProjection`, `TangentSpace`, `RATTLE`).

@@ -24,11 +24,13 @@ from ..solvers import (
     first_step,
     takes_residuals,
 )
-from ..types import Args, BoolLike, Time, Y
+from ..types import Time, Y
+from .crossings import OneCrossing, OnStates
 from .passages import Undetermined, passages, watched
 from .problem import Problem
 from .start import is_saved_part
 from .summed_errors import SummedErrors
+from .traced_once import TracedOnce
 from .trajectory_adjoint import as_it_is, can_be_taped
 
 
@@ -78,15 +80,15 @@ def call(solve: "Solve", problem: Problem) -> tuple[Any, ...]:
     }
     saveat = eqx.tree_at(lambda s: s.subs, solve.saveat, subs, is_leaf=lambda x: x is None)
     event = cast(diffrax.Event | None, solve.event)
-    event = event and dataclasses.replace(
-        event,
-        cond_fn=jax.tree.map(
-            lambda c, up: _on_states(c, decode, args, up),
-            event.cond_fn,
-            event.direction,
-            is_leaf=lambda x: x is None or callable(x),
-        ),
-    )
+    if event is not None:
+        direction = jnp.where(t1 < t0, -1, 1)
+        given = {
+            "terms": solve.formulation.term(), "solver": solve.solver, "t0": t0, "t1": t1, "dt0": problem.dt0, "saveat": solve.saveat,
+            "stepsize_controller": solve.controller, "max_steps": solve.max_steps,
+        }  # fmt: skip
+        on_states = lambda c, up: OnStates(c, decode, args, direction, up, given)
+        conditions = jax.tree.map(on_states, event.cond_fn, event.direction, is_leaf=lambda x: x is None or callable(x))
+        event = dataclasses.replace(event, cond_fn=conditions)
     saveat = dataclasses.replace(saveat, solver_state=True) if counts(solver) else saveat
     sums_errors = isinstance(controller, diffrax.ConstantStepSize) and not solve.recording
     controller = SummedErrors(controller) if sums_errors else controller
@@ -96,7 +98,7 @@ def call(solve: "Solve", problem: Problem) -> tuple[Any, ...]:
         saveat = dataclasses.replace(saveat, controller_state=True)
     sol = diffrax.diffeqsolve(
         solve.formulation.term(),
-        _for_derivative(solve, solver, y),
+        _for_loops(solve, solver, y, _real(event, t0, y, ode), t0, t1),
         t0, t1, dt0, y,
         args=ode, saveat=saveat, stepsize_controller=controller, adjoint=solve.adjoint, event=event,
         max_steps=solve.max_steps, throw=False, progress_meter=solve.progress_meter,
@@ -107,7 +109,7 @@ def call(solve: "Solve", problem: Problem) -> tuple[Any, ...]:
     interpolation = None if path is None else Interpolation(path, decode, ode)
     ts, ys = cast(Any, sol.ts), cast(Any, sol.ys)
     end = jax.lax.stop_gradient(jax.tree.map(lambda x: x[-1], (ts["end"], ys["end"])))
-    stats = {**sol.stats, "end_time": end[0]}
+    stats = {**sol.stats, "end_time": ts["end"][-1]}
     starts = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(y)]))
     result = RESULTS.where(starts, RESULTS.promote(sol.result), RESULTS.no_finite_start)
     stats.update((path.split(".")[-1], operator.attrgetter(path)(sol.solver_state)) for path in counts(solver))
@@ -119,14 +121,23 @@ def call(solve: "Solve", problem: Problem) -> tuple[Any, ...]:
     return sol.t0, sol.t1, ts["user"], ys["user"], interpolation, stats, result, sol.event_mask, seen, end
 
 
-def _for_derivative(solve: "Solve", solver: diffrax.AbstractSolver, y: Y) -> Any:
-    """The solver as diffrax's reverse derivative needs it; the tape knows accepted steps only."""
+def _real(event: diffrax.Event | None, t: Time, y: Y, ode: Equations) -> list[OnStates]:
+    """The conditions of an event that cross zero; others become true."""
+    conditions = [] if event is None else jax.tree.leaves(event.cond_fn, is_leaf=callable)
+    return [c for c in conditions if jnp.issubdtype(eqx.filter_eval_shape(c, t, y, ode).dtype, jnp.floating)]
+
+
+def _for_loops(
+    solve: "Solve", solver: diffrax.AbstractSolver, y: Y, conditions: list[OnStates], t0: Time, t1: Time
+) -> Any:
+    """The solver as diffrax's loops and its reverse derivative need it; the tape knows accepted steps only."""
     size = sum(leaf.size for leaf in jax.tree.leaves(y))
     ours = (isinstance(solver, AbstractManifoldSolver) or takes_residuals(solver)) and not hasattr(
         solver, "root_finder"
     )
     by_diffrax = solve.derivative() == "reverse" and not can_be_taped(solve, size)
-    return WithoutFailedSteps(solver) if ours and by_diffrax else solver
+    solver = WithoutFailedSteps(solver) if ours and by_diffrax else solver
+    return TracedOnce(OneCrossing.of(solver, conditions, solve.formulation, t0, t1) if conditions else solver)
 
 
 def _fitted(controller: diffrax.AbstractStepSizeController, t0: Time, t1: Time) -> Any:
@@ -151,14 +162,3 @@ def _of_residuals(solver: diffrax.AbstractSolver, controller: diffrax.AbstractSt
     if type(controller) is diffrax.PIDController:
         controller = dataclasses.replace(controller, dtmin=None)
     return dataclasses.replace(solver, rtol=rtol, atol=atol), controller
-
-
-def _on_states(cond: Callable[..., BoolLike | Time], decode: Decode, args: Args, up: bool | None) -> Callable[..., Any]:
-    user_args = args
-
-    def condition(t: Time, y: Y, args: Equations, **kwargs: object) -> Any:
-        value = cond(t, decode(t, y, args), user_args, **kwargs)
-        # NaN crosses in no direction: it ends the solve here, which then says so.
-        return value if up is None else jnp.where(jnp.isnan(value), 1 if up else -1, value)
-
-    return condition

@@ -43,6 +43,8 @@ def judged(solve: "Solve", out: Sequence[PyTree], problem: Problem, found: tuple
     lost = ~defined | ~jnp.isfinite(stats["end_time"])
     for name in ("nonlinear_max_steps_reached", "nonfinite_input", "nonfinite"):
         code = failed(getattr(RESULTS, name), RESULTS.undefined_condition, lost)
+    if solve.event is not None:
+        code = failed(RESULTS.nonlinear_max_steps_reached, RESULTS.event_not_located)
     went_well = (code == RESULTS.successful) | (code == RESULTS.event_occurred)
     code = RESULTS.where(went_well & ~defined, RESULTS.undefined_condition, code)
     stuck = [RESULTS.step_rejected, RESULTS.off_manifold, RESULTS.no_convergence, RESULTS.error_too_large]

@@ -14,7 +14,7 @@ from jaxtyping import PyTree
 from .._compat import is_captured, trace_state_clean
 from ..compiler import PullBack, inexact, one_kernel, waiting
 from ..compiler.types import Arrays
-from ..consistent import look_at_end, look_at_start
+from ..consistent import look
 from ..equations.regularity import COARSE
 from ..formulations import AbstractFormulation
 from ..solution import DAESolution
@@ -149,14 +149,12 @@ class Solve:
 
         def check(arrays: Arrays) -> Any:
             system, t0, y0, args, end, tolerances, event = program.whole(arrays)
-            start = look_at_start(system, t0, y0, args, rank, invertible)
             t, state = end
             conditions = [] if event is None else jax.tree.leaves(event.cond_fn, is_leaf=callable)
             finite = [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(state)]
             defined = [~jnp.isnan(condition(t, state, args)) for condition in conditions]
             numbers = (jnp.all(jnp.stack(finite)), jnp.all(jnp.asarray(defined, bool)))
-            at_end = look_at_end(system, t0, y0, args, rank, invertible, end, keeps, tolerances, residual)
-            return start, at_end, numbers
+            return *look(system, t0, y0, args, rank, invertible, end, keeps, tolerances, residual), numbers
 
         return check, arrays
 
@@ -196,7 +194,8 @@ class Solve:
                     return found
 
                 found, through_encoding = jax.vjp(encoded, numbers)
-                of_t0, of_t1, of_ts, of_ys, *_ = cotangent.numbers
+                of_t0, of_t1, of_ts, of_ys, _, of_stats, *_ = cotangent.numbers
+                of_t1 = of_t1 + of_stats["end_time"]
                 fixed_steps = isinstance(self.controller, diffrax.ConstantStepSize)
                 tape = ts["tape"], ys["tape"], None if interpolation is None else interpolation.path.infos
                 of_taped = cotangents(eqx.combine(found, Taped(*fixed)), fixed_steps, tape, of_ys)

@@ -46,7 +46,7 @@ class Reset(eqx.Module):
       output.
     - `reset(t, y, args) -> (y, args)`: the state and the `args` that the solve goes on with. The nearest consistent state to
       it is taken, in the sense of `consistent_state`.
-    - `direction`: `True` for upcrossings only, `False` for downcrossings only.
+    - `direction`: `True` for upcrossings only, `False` for downcrossings only, in the direction in which the solve goes.
     - `fixed`: entries of the state that are kept when it is made consistent, as in `consistent_state`.
     - `max_resets`: how many there may be; one more ends the solve with `RESULTS.too_many_jumps`, and so do resets that pile
       up at one time.
@@ -123,6 +123,17 @@ def _refuse_wrong_reset(event: Reset, t: Time, y: State, args: Args) -> None:
             f"`reset(t, y, args)` must return (y, args), the state and the args to go on with, {describe((y, args))}, but "
             f"returns {describe(found)}."
         )
+    for x, before in zip(jax.tree.leaves(found[1]), jax.tree.leaves(args), strict=True):
+        if not isinstance(before, NUMBERS):
+            if x is not before:
+                raise ValueError(
+                    f"`reset(t, y, args)` changes {brief(before)} in `args`, which is no number, to {brief(x)}."
+                )
+        elif not np.can_cast(jnp.result_type(x), jnp.result_type(before), "same_kind"):
+            raise ValueError(
+                f"`reset(t, y, args)` returns {describe(x)} for an entry of `args` that is {describe(before)}: it would be cut off. "
+                "Start with 1.0 in place of 1."
+            )
     if event.fixed is not None:
         broadcast_to_state("fixed", event.fixed, y, "booleans")
 
@@ -149,8 +160,8 @@ class _FromStart(eqx.Module):
 
 
 class _Progress(NamedTuple):
-    """Where a solve stands: the start of the next part, what was saved so far, and how the last part ended; `level` is the
-    condition at the start of the last part.
+    """Where a solve stands: the start of the next part, what was saved so far, `changed` of the args beside, and how the last part
+    ended; `level` is the condition at the start of the last part.
     """
 
     t: Float[Array, ""]
@@ -160,6 +171,7 @@ class _Progress(NamedTuple):
     times: Float[Array, " jumps"]
     ts: Float[Array, " times"]
     ys: Any
+    changed: list[Array]
     stats: Any
     code: Int[Array, ""]
     level: Float[Array, ""]
@@ -187,11 +199,14 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Any]:
         [t0[None] if output.t0 else empty, empty if output.ts is None else output.ts, t1[None] if output.t1 else empty]
     )
     sign = jnp.where(t1 < t0, -1, 1).astype(t0.dtype)
+    changes = _changes(reset, t0, y0, args)
+    numbers, others = eqx.partition(args, _is_number)
     resolution = float(jnp.finfo(t0.dtype).eps) ** 0.75
     going = int(RESULTS.event_occurred._value)
 
-    def part(p: _Progress) -> tuple[DAESolution, Any, Any]:
-        level = _level_at_start(system, reset.condition, p.t, p.y, p.args, p.level, rank)
+    def part(p: _Progress) -> tuple[DAESolution, Any]:
+        args = eqx.combine(p.args, others)
+        level = _level_at_start(system, reset.condition, sign, p.t, p.y, args, p.level, rank)
         # A downcrossing, as bisection has to know which way it goes.
         up = {True: -1, False: 1, None: jnp.sign(level)}[reset.direction]
         event = diffrax.Event(
@@ -202,37 +217,42 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Any]:
         later = sign * jnp.maximum(sign * wanted, sign * p.t)
         subs = {"wanted": dataclasses.replace(output, t0=False, t1=False, ts=later), "end": diffrax.SubSaveAt(t1=True)}
         one = dataclasses.replace(solve, event=event, saveat=diffrax.SaveAt(subs=subs))
-        return *one(dataclasses.replace(problem, t0=p.t, y0=p.y, args=p.args)), level
+        sol, _ = one(dataclasses.replace(problem, t0=p.t, y0=p.y, args=args))
+        return dataclasses.replace(sol, args=None), level
 
     def advance(p: _Progress) -> _Progress:
-        sol, _, level = part(p)
+        sol, level = part(p)
         end, reached = sol.ts["end"][-1], jax.tree.map(lambda y: y[-1], sol.ys["end"])
         here = (sign * wanted >= sign * p.t) & (sign * wanted <= sign * end)
         ts = jnp.where(here, wanted, p.ts)
-        ys = jax.tree.map(lambda a, b: jnp.where(here.reshape(-1, *(1,) * (a.ndim - 1)), a, b), sol.ys["wanted"], p.ys)
+        choose = lambda a, b: jnp.where(here.reshape(-1, *(1,) * (b.ndim - 1)), a, b)
+        ys = jax.tree.map(choose, sol.ys["wanted"], p.ys)
+        changed = list(map(choose, jax.tree.leaves(eqx.filter(p.args, changes)), p.changed))
         stats = {k: p.stats[k] + v for k, v in sol.stats.items() if k not in NO_COUNTS}
         stats["doubts"] = p.stats["doubts"] | sol.stats["doubts"]
         code = sol.result._value
         # Jumps so close that their order is round-off are no events any more.
         piled = (p.count > 0) & (sign * (end - p.t) <= 16 * resolution * (1 + jnp.abs(end)))
         jumps, exhausted = code == going, piled | (p.count >= reset.max_resets)
-        y, args = lax.cond(
+        y, after = lax.cond(
             jumps & ~exhausted,
-            lambda: _after(system, reset, end, reached, p.args),
+            lambda: _after(system, reset, end, reached, eqx.combine(p.args, others)),
             lambda: (jax.tree.map(jnp.asarray, reached), p.args),
         )
         times = jnp.where((jnp.arange(reset.max_resets) == p.count) & jumps & ~exhausted, end, p.times)
         code = jnp.where(jumps & exhausted, RESULTS.too_many_jumps._value, code)
-        return _Progress(end, y, args, p.count + (jumps & ~exhausted), times, ts, ys, stats, code, level)
+        return _Progress(end, y, after, p.count + (jumps & ~exhausted), times, ts, ys, changed, stats, code, level)
 
     unknown = jnp.zeros_like(t0)
     none: Any = None
-    shape = jax.eval_shape(part, _Progress(t0, y0, args, none, none, none, none, none, none, unknown))[0]
+    shape = jax.eval_shape(part, _Progress(t0, y0, numbers, none, none, none, none, none, none, none, unknown))[0]
     unsaved = jax.tree.map(lambda x: jnp.full(x.shape, jnp.inf, x.dtype), shape.ys["wanted"])
     stats = {k: jnp.zeros((), int) for k in shape.stats if k not in NO_COUNTS}
+    over_times = lambda x: jnp.broadcast_to(x, (*wanted.shape, *jnp.shape(x)))
+    given = list(map(over_times, jax.tree.leaves(eqx.filter(numbers, changes))))
     start = _Progress(
-        t0, y0, args, jnp.zeros((), int), jnp.full(reset.max_resets, jnp.inf, t0.dtype),
-        jnp.full_like(wanted, jnp.inf), unsaved, stats, jnp.asarray(going, RESULTS.successful._value.dtype), unknown,
+        t0, y0, numbers, jnp.zeros((), int), jnp.full(reset.max_resets, jnp.inf, t0.dtype),
+        jnp.full_like(wanted, jnp.inf), unsaved, given, stats, jnp.asarray(going, RESULTS.successful._value.dtype), unknown,
     )  # fmt: skip
     kind: Any = "checkpointed" if solve.derivative() == "reverse" else "lax"
     max_steps = reset.max_resets + 1 if kind == "checkpointed" else None
@@ -240,7 +260,8 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Any]:
     stats = {"max_steps": solve.max_steps, **p.stats, "end_time": p.t, "jumps": p.count, "jump_times": p.times}
     result = eqx.tree_at(lambda r: r._value, RESULTS.successful, p.code)
     precision = precision_of(t0.dtype, solve.controller)
-    sol = DAESolution(t0, t1, p.ts, p.ys, None, stats, result, None, args, count_of(rank), precision)
+    along = jax.tree.unflatten(jax.tree.structure(eqx.filter(numbers, changes)), p.changed)
+    sol = DAESolution(t0, t1, p.ts, p.ys, None, stats, result, None, args, count_of(rank), precision, along)
     refused = (
         RESULTS.inconsistent_start,
         RESULTS.dependent_constraints,
@@ -250,31 +271,50 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Any]:
     return sol, ~jnp.any(jnp.stack([p.code == code._value for code in refused]))
 
 
+def _is_number(x: object) -> bool:
+    return isinstance(x, NUMBERS)
+
+
+def _changes(reset: Reset, t: Time, y: State, args: Args) -> PyTree[bool]:
+    """Which leaves of `args` are not handed on as they are."""
+    found: list[PyTree[bool]] = []
+
+    def look(t: Time, y: State, args: Args) -> None:
+        _, new = reset.reset(t, y, args)
+        found.append(jax.tree.map(lambda x, before: x is not before, new, args))
+
+    eqx.filter_eval_shape(look, t, y, args)
+    return found[0]
+
+
 def _after(system: System, reset: Reset, t: Time, y: State, args: Args) -> tuple[Any, Any]:
-    """The state and the args after a reset."""
+    """The state and the numbers in the args after a reset."""
     y, new = reset.reset(t, y, args)
     y = consistent_state(system, t, y, new, fixed=reset.fixed)
-    return y, jax.tree.map(lambda x, like: jnp.asarray(x, jnp.result_type(like)), new, args)
+    return y, jax.tree.map(
+        lambda x, like: jnp.asarray(x, jnp.result_type(like)), *(eqx.filter(a, _is_number) for a in (new, args))
+    )
 
 
 def _level_at_start(
     system: System,
     condition: Callable[..., Time],
+    sign: Scalar,
     t: Scalar,
     y: State,
     args: Args,
     before: Scalar,
     rank: int | Rank | None,
 ) -> Any:
-    """The condition at the start of a part; where this is zero, the sign with which it leaves zero. That is the sign with
-    which it came, −`before`, where its rate is not known.
+    """The condition at the start of a part; where this is zero, the sign with which it leaves zero, forwards or, with `sign` −1,
+    backwards. That is the sign with which it came, −`before`, where its rate is not known.
     """
     value = jnp.asarray(condition(t, y, args))
     # The state as it is: one made anew from the underlying ODE is NaN where the structure allows what the numbers do not.
     z, ode = underlying_ode(system, t, y, args, rank)
     of = lambda t, z: jnp.asarray(condition(t, ode.decode(t, z), args), t.dtype)
     _, rate = jax.jvp(of, (t, z), (jnp.ones_like(t), ode.field(t, z)))
-    rate = jnp.where(jnp.isfinite(rate), rate, -before)
+    rate = jnp.where(jnp.isfinite(rate), sign * rate, -before)
     zero = float(jnp.finfo(t.dtype).eps) ** 0.5 * (1 + jnp.abs(rate))
     leaves = (jnp.abs(value) <= zero) & (rate != 0)
     return lax.stop_gradient(jnp.where(leaves, jnp.where(rate > 0, zero, -zero), value))

@@ -100,8 +100,8 @@ def _looped(s: Float[Array, "m m"], b: Float[Array, "m *k"]) -> Float[Array, "m 
         inverse = 1 / definite_pivot(pivot, diagonal[j], m)
         row, right = s[j] * inverse, rhs[j] * inverse
         # Row j becomes the scaled pivot row; from every other row its multiple is taken.
-        factor = jnp.where((rows == j)[:, None], pivot - 1, s[:, j][:, None])
-        return s - factor * row, rhs - factor * right
+        here, factor = (rows == j)[:, None], s[:, j][:, None]
+        return jnp.where(here, row, s - factor * row), jnp.where(here, right, rhs - factor * right)
 
     _, rhs = jax.lax.fori_loop(0, m, eliminate, (s, rhs))
     return rhs if b.ndim == 2 else rhs[:, 0]

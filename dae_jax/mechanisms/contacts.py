@@ -114,6 +114,9 @@ class Motion(AbstractHolonomicJoint):
         wanted = jnp.reshape(jnp.asarray(self.motion(t, args)), ())
         return self.coordinate.off(at, wanted)[None]
 
+    def counts(self, at: Configuration) -> tuple[int, int]:
+        return 1, 0
+
     @property
     def coordinates(self) -> dict[Kind, Coordinate]:
         return {self.coordinate.kind: self.coordinate}

@@ -45,6 +45,10 @@ class AbstractJoint(eqx.Module):
     def nonholonomic(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
         """What is 0 of the velocities, beyond the derivative of `constraint`."""
 
+    def counts(self, at: Configuration) -> tuple[int, int]:
+        """How many equations there are of positions, and how many of velocities; of joints that read no `args`."""
+        return len(self.constraint(0.0, at, None)), len(self.nonholonomic(0.0, at, None))
+
     @property
     @abc.abstractmethod
     def coordinates(self) -> dict[Kind, Coordinate]:

@@ -134,14 +134,11 @@ class Mechanism(eqx.Module):
 
     def _shapes(self) -> tuple[list[int], list[int]]:
         """How many equations each joint has, of positions and of velocities."""
-        q, v = self.reference
-
-        def found(q: Coordinates, v: Coordinates) -> list[tuple[Array, Array]]:
-            at = self.configuration(q, v)
-            return [(joint.constraint(0.0, at, None), joint.nonholonomic(0.0, at, None)) for joint in self.joints]
-
-        shapes = jax.eval_shape(found, q, v)
-        return [g.shape[0] for g, _ in shapes], [h.shape[0] for _, h in shapes]
+        found: list[tuple[int, int]] = []
+        jax.eval_shape(
+            lambda q, v: found.extend(joint.counts(self.configuration(q, v)) for joint in self.joints), *self.reference
+        )
+        return [g for g, _ in found], [h for _, h in found]
 
     def rows(self) -> dict[str, tuple[list[int], list[int]]]:
         """{joint: its rows in `constraint` and in `nonholonomic`}."""

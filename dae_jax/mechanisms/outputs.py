@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .. import diagnostics
+from .. import diagnostics, solution
 from ..solution import DAESolution, without_padding
 from ..types import Args, Time
 from .bodies import GROUND, wrench
@@ -152,7 +152,7 @@ def power(mechanism: "Mechanism", sol: DAESolution) -> dict[str, Float[Array, " 
 
 def at_saved_times(sol: DAESolution, of: Callable[..., Any], *more: Array) -> Any:
     """of(t, y, *more, args) at each saved time; `more` has these along its first axis."""
-    return _mapped(of, (*without_padding(sol.ts, sol.ys), *more), sol.args)
+    return _mapped(of, sol.ts, sol.ys, sol.args, sol.changed, *more)
 
 
 def _at_saved_times(
@@ -162,7 +162,4 @@ def _at_saved_times(
     return at_saved_times(sol, lambda t, y, args: of(t, mechanism.configuration(*y), args))
 
 
-@eqx.filter_jit
-def _mapped(of: Callable[..., Any], over: tuple[Any, ...], args: Args) -> Any:
-    """of(*row, args) for each row."""
-    return jax.vmap(lambda *row: of(*row, args))(*over)
+_mapped = eqx.filter_jit(solution.at_saved_times)

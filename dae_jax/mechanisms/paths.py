@@ -30,6 +30,9 @@ class OnPath(AbstractHolonomicJoint):
             )
         return place - wanted
 
+    def counts(self, at: Configuration) -> tuple[int, int]:
+        return at.dimension, 0
+
     @property
     def coordinates(self) -> dict[Kind, Coordinate]:
         return {}

@@ -123,10 +123,6 @@ class Unrolled(AbstractWrapper):
         assert isinstance(self.solver.tableau, diffrax.ButcherTableau)
         return self.solver.tableau
 
-    @property
-    def scan_kind(self) -> Any:
-        return self.solver.scan_kind
-
     def func(self, terms: diffrax.AbstractTerm, t0: Time, y0: Any, args: Any) -> Any:
         return terms.vf(t0, y0, args)
 

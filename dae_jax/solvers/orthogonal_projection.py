@@ -49,18 +49,6 @@ class OrthogonalProjection(AbstractWrapper, AbstractManifoldSolver):
     def recomputable(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         return is_recomputable(self.solver)
 
-    @property
-    def scan_kind(self) -> Any:
-        return self.solver.scan_kind  # pyright: ignore[reportAttributeAccessIssue]
-
-    @property
-    def root_finder(self) -> Any:
-        return self.solver.root_finder  # pyright: ignore[reportAttributeAccessIssue]
-
-    @property
-    def root_find_max_steps(self) -> Any:
-        return self.solver.root_find_max_steps  # pyright: ignore[reportAttributeAccessIssue]
-
     def init(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any) -> Any:
         return unrolled(self.solver).init(terms, t0, t1, y0, args)
 

@@ -18,6 +18,19 @@ class AbstractWrapper(diffrax.AbstractWrappedSolver):
     def interpolation_cls(self) -> Any:
         return self.solver.interpolation_cls
 
+    # diffrax looks for these, and fills them in.
+    @property
+    def scan_kind(self) -> Any:
+        return self.solver.scan_kind  # pyright: ignore[reportAttributeAccessIssue]
+
+    @property
+    def root_finder(self) -> Any:
+        return self.solver.root_finder  # pyright: ignore[reportAttributeAccessIssue]
+
+    @property
+    def root_find_max_steps(self) -> Any:
+        return self.solver.root_find_max_steps  # pyright: ignore[reportAttributeAccessIssue]
+
     def order(self, terms: diffrax.AbstractTerm) -> Any:
         return self.solver.order(terms)
 

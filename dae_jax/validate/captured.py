@@ -8,13 +8,17 @@
 
 A compiled program is known by its functions. Here each of them becomes one that is equal to itself only as long as the numbers,
 arrays, containers, functions, classes and attributes of objects are that it finds in its closure, its defaults, the globals and
-modules it names, and the object that it is a method of.
+modules it names, and the object that it is a method of. An object that is handed over as it is, in `args`, becomes a copy that is
+another one when what is in it has changed.
 """
 
 import contextlib
+import copy
 import dataclasses
 import functools
 import hashlib
+import itertools
+import marshal
 import sys
 import sysconfig
 import types
@@ -34,20 +38,27 @@ T = TypeVar("T")
 LIBRARIES = frozenset(
     "builtins dae_jax diffrax equinox functools jax jaxlib jaxtyping lineax math numpy operator optax optimistix scipy".split()
 )
-# Containers and objects with more in them are known by what they are, not by what is in them.
+# Containers and objects with more than so many containers and objects in them are known by what they are.
 MOST = 2000
 _CONTAINERS = frozenset({list, tuple, dict, set, frozenset, deque, array})
+# Of any size these are known by what is in them, where that is of these types.
+_PLAIN = frozenset({list, tuple, dict})
+_PRIMITIVE = frozenset({type(None), bool, int, float, complex, str, bytes})
 # What Python keeps with every class, and what changes without meaning.
 _OF_EVERY_CLASS = frozenset(
     "__dict__ __weakref__ __module__ __doc__ __qualname__ __slots__ __annotations__ __abstractmethods__ _abc_impl".split()
 )
-# How many functions are remembered that have changed what is around them.
+# How many functions are remembered that have changed what is around them, and how many objects that may change.
 REMEMBERED = 1024
 _before: dict["Captured", "Captured"] = {}
+_copies: dict[Hashable, Any] = {}
 
 
 def current(tree: T) -> T:
-    """The tree with its functions as they are with the values of now."""
+    """The tree with its functions, and its objects that are no pytrees, as they are with the values of now.
+
+    Errors: `TypeError` for an object that is no pytree and has no hash.
+    """
     return jax.tree.map(_current, tree, is_leaf=_is_function_with_leaves)
 
 
@@ -139,13 +150,32 @@ def _is_function_with_leaves(x: object) -> bool:
 def _current(x: Any) -> Any:
     if _is_function_with_leaves(x):
         return CapturedModule(x, _Look().value(type(x)))
-    if not callable(x) or isinstance(x, Captured | CapturedModule | type) or _of_library(x):
+    if isinstance(x, Captured | CapturedModule | type | jax.Array | np.ndarray):
         return x
+    if x.__hash__ is None:
+        name = type(x).__name__
+        raise TypeError(
+            f"A {name} is no pytree: JAX does not see the numbers in it. Make {name} an `equinox.Module`, register it by "
+            "`jax.tree_util.register_dataclass`, or hand over a dictionary."
+        )
+    if _of_library(x):
+        return x
+    if not callable(x):
+        return _copied(_Look().value(x), x)
     values = _Look().of_callable(x)
     if not values:
         return x
     found = Captured(x, values)
     return _before.get(found, found) if _before else found
+
+
+def _copied(values: Hashable, x: Any) -> Any:
+    """An object in place of `x` that is the same one as long as the same values are in it."""
+    if values not in _copies:
+        _copies[values] = copy.copy(x)
+        for oldest in list(_copies)[:-REMEMBERED]:
+            _copies.pop(oldest)
+    return _copies[values]
 
 
 def _of_library(x: object) -> bool:
@@ -232,12 +262,15 @@ class _Look:
             return "within itself"
         if not self.seen:
             self.count = 0
+        before = self.count
         self.seen.append(x)
         try:
             return look(x)
         except _TooMuch:
-            if len(self.seen) > 1:
+            # What is large itself is known by what it is, what is beside it by what is in that.
+            if len(self.seen) > 1 and self.count - before < MOST // 2:
                 raise
+            self.count = before + MOST // 20
             return Same(x)
         finally:
             self.seen.pop()
@@ -250,6 +283,8 @@ class _Look:
         if isinstance(x, staticmethod | classmethod):
             return self._counted(x.__func__)
         found: list[Hashable] = []
+        if type(x) in _PLAIN and len(x) > MOST // 20 and _PRIMITIVE.issuperset(map(type, _entries(x))):
+            return type(x), hashlib.blake2b(marshal.dumps(x, 2)).digest()
         if isinstance(x, dict | types.MappingProxyType):
             found += [(Same(k) if k.__hash__ is None else k, self._counted(y)) for k, y in x.items()]
         elif isinstance(x, set | frozenset):
@@ -279,6 +314,10 @@ def _attributes(x: object) -> dict[str, Any]:
     slots = [name for of in type(x).__mro__ for name in _tuple(vars(of).get("__slots__", ()))]
     found = {name: getattr(x, name) for name in slots if name not in _OF_EVERY_CLASS and hasattr(x, name)}
     return found | getattr(x, "__dict__", {})
+
+
+def _entries(x: Any) -> Iterable[object]:
+    return itertools.chain(x.keys(), x.values()) if type(x) is dict else x
 
 
 def _tuple(x: Any) -> tuple[str, ...]:

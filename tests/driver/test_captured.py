@@ -387,8 +387,81 @@ def test_a_network_is_known_by_its_weights():
 
 
 def test_what_is_large_is_known_by_what_it_is():
-    many = [float(k) for k in range(100_000)]
+    many = [[float(k)] for k in range(100_000)]
     fn = lambda: many[0]
     assert current(fn) == current(fn)
-    many[0] = 1.0
+    many[0][0] = 1.0
     assert current(fn) == current(fn)
+
+
+@pytest.mark.parametrize("change", ["an entry", "a key", "beside"])
+def test_what_is_large_is_looked_into_all_the_same(change):
+    holder = types.SimpleNamespace(
+        many=[float(k) for k in range(100_000)],
+        keys=dict.fromkeys(range(10_000), 0.0),
+        deep=[[k] for k in range(10_000)],
+        k=1,
+    )
+    fn = lambda: holder.many[0] + holder.deep[0][0] + holder.k
+    before = current(fn)
+    assert current(fn) == before
+    if change == "an entry":
+        holder.many[70_000] = 1.5
+    elif change == "a key":
+        holder.keys[70] = "0.0"
+    else:
+        holder.k = 2
+    assert current(fn) != before
+
+
+class Held:
+    """An object that is no pytree."""
+
+    def __init__(self, k):
+        self.k = k
+        self.deeper = {"k": 0.0}
+
+
+@pytest.mark.parametrize("deep", [False, True])
+def test_an_object_in_the_arguments(deep):
+    """It may change between two calls, which is seen everywhere; a solution keeps the one that it was computed with."""
+    held = Held(9.81)
+    system = ConstrainedSystem(
+        lambda t, q, v, args: along(args["of"].k + args["of"].deeper["k"]),
+        circle,
+        potential=lambda q, args: -(args["of"].k + args["of"].deeper["k"]) * q[1],
+    )
+    solved = lambda: dae_jax.daesolve(system, SOLVER, 0.0, 1.0, None, START, {"of": held})
+    at_a_point = lambda: float(dae_jax.multipliers(system, 0.0, jnp.array([0.0, 1.0]), jnp.zeros(2), {"of": held})[0])
+    first, pulled = solved(), at_a_point()
+    assert pulled == pytest.approx(9.81)
+    if deep:
+        held.deeper["k"] = -8.81
+    else:
+        held.k = 1.0
+    second = solved()
+    plain = end(ConstrainedSystem(lambda t, q, v, args: jnp.array([0.0, 1.0]), circle))
+    assert np.allclose(second.ys[0][-1], plain, atol=1e-12)
+    assert at_a_point() == pytest.approx(1.0)
+    assert not np.allclose(first.ys[0][-1], plain, atol=0.1)
+    assert float(dae_jax.energy(system, second)[-1]) == pytest.approx(0.0, abs=1e-6)
+    if not deep:
+        assert float(dae_jax.energy(system, first)[-1]) == pytest.approx(0.0, abs=1e-6)
+    count = program._jitted._cache_size()
+    solved()
+    assert program._jitted._cache_size() == count
+
+
+def test_an_object_in_the_arguments_of_a_state_that_is_sought():
+    held = Held(2.0)
+    system = dae_jax.ImplicitDAE(lambda t, y, yd, args: [yd[0] + y[0], y[1] - args.k * y[0]])
+    sought = lambda: dae_jax.consistent_state(system, 0.0, jnp.array([1.0, 0.0]), held, fixed=jnp.array([True, False]))
+    assert sought()[1] == pytest.approx(2.0)
+    held.k = 3.0
+    assert sought()[1] == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize("held", [types.SimpleNamespace(k=1.0), {1.0}], ids=["without a hash", "a set"])
+def test_an_object_in_the_arguments_that_is_refused(held):
+    with pytest.raises(TypeError, match="is no pytree: JAX does not see the numbers in it"):
+        end(ConstrainedSystem(lambda t, q, v, args: along(9.81), circle), args=held)

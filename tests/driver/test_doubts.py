@@ -69,3 +69,27 @@ def test_a_solve_that_failed_has_none():
     sol = solved(spring(1e6), throw=False)
     assert int(sol.result._value) != 0
     assert of(sol) == 0
+
+
+CUBE_ROOT = dae_jax.SemiExplicitDAE(lambda t, x, z, a: -jnp.ones(1), lambda t, x, z, a: z**3 - x)
+ON_A_SPHERE = dae_jax.ImplicitDAE(
+    lambda t, y, yd, a: jnp.stack([yd[0] - y[1], yd[1] + y[0] * y[2], y[0] ** 2 + y[1] ** 2 + y[2] ** 2 - 3])
+)
+
+
+@pytest.mark.parametrize("dt0", [0.1, 0.013])
+def test_equations_that_do_not_hold_at_the_end(dt0):
+    """z = x^(1/3) through 0, where the underlying ODE has a pole that fixed steps leap over."""
+    with pytest.raises(RuntimeError, match="does not satisfy the constraints at its end"):
+        dae_jax.daesolve(CUBE_ROOT, diffrax.Tsit5(), 0.0, 2.0, dt0, (jnp.ones(1), jnp.ones(1)))
+
+
+def test_drift_off_equations_beyond_the_tolerances():
+    loose = diffrax.PIDController(rtol=3e-5, atol=3e-5)
+    solve = lambda solver, t1: solved(ON_A_SPHERE, solver, t1, None, jnp.ones(3), stepsize_controller=loose)
+    with pytest.warns(AccuracyWarning, match="drift"):
+        sol = solve(diffrax.Tsit5(), 3e5)
+    assert of(sol) == 1
+    assert float(dae_jax.drift(ON_A_SPHERE, sol).levels[0][-1]) > 1
+    assert of(solve(TSIT5, 1e4)) == 0
+    assert of(solved(ON_A_SPHERE, dae_jax.RadauIIA5(), 100.0, None, jnp.ones(3))) == 0

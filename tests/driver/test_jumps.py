@@ -236,3 +236,135 @@ def test_the_former_name_warns():
         old = dae_jax.Jump(condition, bounced, most=3)
     assert isinstance(old, dae_jax.Reset)
     assert (old.condition, old.reset, old.max_resets) == (condition, bounced, 3)
+
+
+def held(**others):
+    """A pendulum whose bob becomes heavier at t = 0.3, or its rod longer."""
+    system = dae_jax.ConstrainedSystem(
+        lambda t, q, v, a: jnp.array([0.0, -GRAVITY * a["m"]]),
+        lambda t, q, a: (q @ q - a["l"] ** 2) / 2,
+        mass=lambda q, a: a["m"] * jnp.eye(2),
+        potential=lambda q, a: GRAVITY * a["m"] * q[1],
+    )
+    return system, lambda reset: dae_jax.daesolve(
+        system, dae_jax.OrthogonalProjection(dae_jax.DOP853()), 0.0, 1.0, None,
+        (jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])), {"m": jnp.array(1.0), "l": jnp.array(1.0), **others},
+        event=dae_jax.Reset(lambda t, y, a, **_: t - 0.3, reset), saveat=diffrax.SaveAt(ts=np.linspace(0, 1, 6)),
+    )  # fmt: skip
+
+
+def test_what_a_reset_changes_of_the_args_counts_in_diagnostics():
+    system, solve = held(name="bob")
+    sol = solve(lambda t, y, a: (y, {**a, "m": 3 * a["m"]}))
+    (q, v), mass = sol.ys, np.where(sol.ts < 0.3, 1.0, 3.0)
+    np.testing.assert_array_equal(sol.changed["m"], mass)
+    assert sol.changed["l"] is None
+    height, speed = np.asarray(q[:, 1]), np.sum(np.asarray(v) ** 2, 1)
+    pull = mass * (speed - GRAVITY * height)
+    np.testing.assert_allclose(dae_jax.multipliers(system, sol)[:, 0], pull, rtol=1e-9)
+    np.testing.assert_allclose(dae_jax.energy(system, sol), mass * (speed / 2 + GRAVITY * height), rtol=1e-9)
+    longer = solve(lambda t, y, a: ((2 * y[0], y[1]), {**a, "l": 2 * a["l"]}))
+    np.testing.assert_allclose(jnp.linalg.norm(longer.ys[0], axis=1), np.where(longer.ts < 0.3, 1.0, 2.0), atol=1e-12)
+    assert float(dae_jax.drift(system, longer).position.max()) < 1e-14
+
+
+def test_the_args_of_each_lane_count_in_diagnostics():
+    system, solve = held()
+    batch = jax.vmap(lambda by: solve(lambda t, y, a: (y, {**a, "m": by * a["m"]})))(jnp.array([2.0, 3.0]))
+    for k, by in enumerate((2.0, 3.0)):
+        one = solve(lambda t, y, a, by=by: (y, {**a, "m": by * a["m"]}))
+        np.testing.assert_allclose(dae_jax.energy(system, batch)[k], dae_jax.energy(system, one), rtol=1e-9)
+
+
+def test_a_reset_that_would_cut_off_what_it_returns_is_refused():
+    ramp = dae_jax.ImplicitDAE(lambda t, y, yd, a: yd - a)
+    faster = dae_jax.Reset(lambda t, y, a, **_: t - 1, lambda t, y, a: (y, a * 1.5))
+    solve = lambda a: dae_jax.daesolve(ramp, dae_jax.DOP853(), 0.0, 2.0, None, jnp.zeros(1), a, event=faster)
+    with pytest.raises(ValueError, match=r"returns float64.* that is int.*: it would be cut off. Start with 1.0"):
+        solve(1)
+    np.testing.assert_allclose(solve(1.0).ys, [[2.5]], rtol=1e-12)
+
+
+FLIP = lambda t, y, a: ((y[0], -y[1]), a)
+FINDER = optimistix.Bisection(1e-12, 1e-12, flip="detect")
+THROWN = (jnp.array([0.0, 0.1]), jnp.array([0.0, -3.0]))
+
+
+def thrown(event, solver=None, t0=2.0, t1=0.0, **options):
+    solver = dae_jax.OrthogonalProjection(dae_jax.DOP853()) if solver is None else solver
+    return dae_jax.daesolve(BALL, solver, t0, t1, None, THROWN, event=event, **options)
+
+
+def by_scipy(condition, t0, t1):
+    """The first crossing, of a fall from `THROWN`, and the height there."""
+    condition.terminal = True
+    fall = lambda t, z: [z[1], -GRAVITY]
+    found = solve_ivp(fall, (t0, t1), [0.1, -3.0], events=condition, rtol=1e-12, atol=1e-12, max_step=0.01)
+    return found.t[-1], found.y[0, -1]
+
+
+@pytest.mark.parametrize("solver", [diffrax.Tsit5(), dae_jax.RadauIIA5(), dae_jax.BDF()], ids=["tsit", "radau", "bdf"])
+def test_conditions_know_the_time_in_a_solve_backwards(solver):
+    level = lambda t, y, a, **_: y[0][1] - 0.2 * t
+    time, height = by_scipy(lambda t, z: z[0] - 0.2 * t, 2.0, 0.0)
+    sol = thrown(diffrax.Event(level, FINDER), solver)
+    np.testing.assert_allclose((sol.ts[-1], sol.ys[0][-1, 1]), (time, height), atol=1e-8)
+    sol = thrown(dae_jax.Reset(lambda t, y, a, **_: t - 1.5, FLIP), solver)
+    assert sol.stats["jumps"] == 1
+    np.testing.assert_allclose(sol.stats["jump_times"][0], 1.5, atol=1e-9)
+    np.testing.assert_allclose(sol.ys[1][-1, 1], -(-3 + GRAVITY * 0.5) + GRAVITY * 1.5, atol=1e-8)
+
+
+def test_a_solve_backwards_leaves_the_reset_where_it_started():
+    """The condition is zero at the start, and would be found again there."""
+    sol = thrown(dae_jax.Reset(lambda t, y, a, **_: y[0][1] - 0.1, FLIP, max_resets=2), t1=1.7)
+    assert sol.stats["jumps"] == 0
+    np.testing.assert_allclose(sol.ys[0][-1, 1], 0.1 + 0.9 - GRAVITY / 2 * 0.09, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "solver", [diffrax.Tsit5(), dae_jax.OrthogonalProjection(dae_jax.DOP853()), dae_jax.RadauIIA5(), dae_jax.BDF()]
+)
+def test_a_condition_that_crosses_and_comes_back_within_a_step(solver):
+    """A ball thrown up passes a height twice; without the condition, the solve is one long step."""
+    up = (jnp.zeros(2), jnp.array([0.0, 3.0]))
+    solve = lambda event, **options: dae_jax.daesolve(BALL, solver, 0.0, 0.6, None, up, event=event, **options)
+    top = 9 / (2 * GRAVITY)
+    for below in (0.1, 1e-3):
+        event = diffrax.Event(lambda t, y, a, **_: y[0][1] - (top - below), FINDER)  # noqa: B023
+        first = (3 - np.sqrt(2 * GRAVITY * below)) / GRAVITY
+        np.testing.assert_allclose(solve(event).ts[-1], first, atol=1e-6)
+    never = diffrax.Event(lambda t, y, a, **_: y[0][1] - (top + 1e-3), FINDER)
+    assert solve(never).ts[-1] == 0.6
+
+
+@pytest.mark.parametrize("order", [0, 1])
+def test_the_first_of_two_events_within_a_step(order):
+    """Whatever their order in the list; two at one time are one."""
+    at = lambda when: lambda t, y, a, **_: t - when
+    finder = optimistix.Newton(1e-10, 1e-10)
+    conditions = [at(1.5), at(1.2)] if order else [at(1.2), at(1.5)]
+    sol = thrown(diffrax.Event(conditions, finder), t0=2.0, t1=0.0)
+    np.testing.assert_allclose(sol.ts[-1], 1.5, atol=1e-10)
+    assert [bool(x) for x in sol.event_mask] == [bool(order), not order]
+    both = thrown(diffrax.Event([at(1.5), at(1.5)], finder))
+    np.testing.assert_allclose(both.ts[-1], 1.5, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    "adjoint", [diffrax.RecursiveCheckpointAdjoint(), diffrax.ForwardMode()], ids=["reverse", "forward"]
+)
+def test_the_time_at_which_a_solve_ends_has_its_derivative(adjoint):
+    derivative = jax.jacfwd if isinstance(adjoint, diffrax.ForwardMode) else jax.grad
+    event = diffrax.Event(lambda t, y, a, **_: y[0][1], optimistix.Newton(1e-10, 1e-10))
+
+    def fallen(height, t1, event):
+        start = (jnp.array([0.0, 1.0]) * height, jnp.zeros(2))
+        return dae_jax.daesolve(BALL, diffrax.Tsit5(), 0.0, t1, None, start, event=event, adjoint=adjoint).stats[
+            "end_time"
+        ]
+
+    np.testing.assert_allclose(
+        derivative(lambda h: fallen(h, 10.0, event))(1.3), 1 / np.sqrt(2 * GRAVITY * 1.3), rtol=1e-7
+    )
+    np.testing.assert_allclose(derivative(lambda t1: fallen(1.3, t1, None))(0.4), 1.0, rtol=1e-12)

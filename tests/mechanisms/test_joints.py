@@ -97,6 +97,18 @@ def test_a_joint_in_the_plane(joint, count, moved):
         assert np.abs(mechanism.constraint(0.0, of(mechanism, b=np.array(moved)), None)).max() < 1e-14
 
 
+def test_what_leads_may_read_the_args():
+    hinge = m.revolute(m.ground, crank := m.Body("crank", 1.0, 0.2, at=(0.5, 0.0)), (0.0, 0.0))
+    motor = m.motor(hinge, motion=lambda t, args: args["rate"] * t)
+    path = lambda t, args: 0.5 * jnp.stack([jnp.cos(args["rate"] * t), jnp.sin(args["rate"] * t)])
+    led = m.point_on_path(m.ground, crank, (0.5, 0.0), path=path)
+    for joints in ([hinge, motor], [led]):
+        mechanism, args = m.Mechanism([crank], joints), {"rate": 3.0}
+        y0 = mechanism.assemble(t0=0.1, args=args)
+        np.testing.assert_allclose(y0[0]["crank"][:2], [0.5 * np.cos(0.3), 0.5 * np.sin(0.3)], atol=1e-9)
+        np.testing.assert_allclose(y0[1]["crank"][:2], [-1.5 * np.sin(0.3), 1.5 * np.cos(0.3)], atol=1e-8)
+
+
 def test_a_point_on_a_curve():
     circle = m.point_on_curve(m.ground, PB, anchor=(0.1, 0.0), curve=lambda p: p @ p - 4.0)
     mechanism = m.Mechanism([PB], [circle])
