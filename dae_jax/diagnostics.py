@@ -4,6 +4,7 @@ Each is an array over `sol.ts`. At times that are padding, of a solve that ended
 value: largest, smallest and final values are then those of the saved times. A batch of solutions has a leading axis more.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, overload
 
@@ -56,14 +57,8 @@ def drift(system: System, sol: DAESolution) -> Drift | EquationDrift:
     refuse_wrong_system(system)
     system = current(system)
     if not is_mechanism(system):
-        return EquationDrift(_at_saved_times(system, sol, lambda t, y, args: equation_drift(system, t, y, args)))
-
-    def largest(t: Time, y: State, args: Args) -> tuple[Any, Any]:
-        ode = MechanicalODE.of(system, t, y, args)
-        g, dg = ode.invariants(t, ode.encode(y))
-        return jnp.max(jnp.abs(g), initial=0), jnp.max(jnp.abs(dg), initial=0)
-
-    return Drift(*_at_saved_times(system, sol, largest))
+        return EquationDrift(_at_saved_times(system, sol, equation_drift))
+    return Drift(*_at_saved_times(system, sol, _largest))
 
 
 def energy(system: ConstrainedSystem, sol: DAESolution) -> Float[Array, " times"]:
@@ -74,18 +69,7 @@ def energy(system: ConstrainedSystem, sol: DAESolution) -> Float[Array, " times"
     if getattr(system, "potential", None) is None:
         raise ValueError("The energy needs `ConstrainedSystem(..., potential=lambda q, args: ...)`.")
     system = current(system)
-    potential: Any = system.potential
-
-    def total(t: Time, y: State, args: Args) -> Any:
-        call = "potential(q, args)"
-        refuse_no_real_number(returned(call, potential, y[0], args), call)
-        ode = MechanicalODE.of(system, t, y, args)
-        flat_q, flat_v = ode.encode(y)
-        mass = dense_mass(ode.mass(flat_q))
-        momentum = flat_v if mass is None else mass * flat_v if mass.ndim < 2 else jnp.dot(mass, flat_v)
-        return jnp.dot(flat_v, momentum) / 2 + potential(y[0], args)
-
-    return _at_saved_times(system, sol, total)
+    return _at_saved_times(system, sol, _energy)
 
 
 @overload
@@ -116,7 +100,7 @@ def multipliers(system: ConstrainedSystem, *at: Any) -> Any:
         )
     if len(at) == 1:
         (sol,) = at
-        return _at_saved_times(system, sol, lambda t, y, args: _multipliers(system, t, y, args, sol.rank))
+        return _at_saved_times(system, sol, functools.partial(_multipliers, rank=sol.rank))
     if len(at) not in (3, 4):
         raise TypeError("`multipliers` takes (system, sol) or (system, t, q, v, args).")
     t, q, v, *args = current(at)
@@ -131,6 +115,23 @@ def multipliers(system: ConstrainedSystem, *at: Any) -> Any:
     return found
 
 
+def _largest(system: ConstrainedSystem, t: Time, y: State, args: Args) -> tuple[Any, Any]:
+    ode = MechanicalODE.of(system, t, y, args)
+    g, dg = ode.invariants(t, ode.encode(y))
+    return jnp.max(jnp.abs(g), initial=0), jnp.max(jnp.abs(dg), initial=0)
+
+
+def _energy(system: ConstrainedSystem, t: Time, y: State, args: Args) -> Any:
+    potential: Any = system.potential
+    call = "potential(q, args)"
+    refuse_no_real_number(returned(call, potential, y[0], args), call)
+    ode = MechanicalODE.of(system, t, y, args)
+    flat_q, flat_v = ode.encode(y)
+    mass = dense_mass(ode.mass(flat_q))
+    momentum = flat_v if mass is None else mass * flat_v if mass.ndim < 2 else jnp.dot(mass, flat_v)
+    return jnp.dot(flat_v, momentum) / 2 + potential(y[0], args)
+
+
 def _multipliers(
     system: ConstrainedSystem, t: Time, y: State, args: Args, rank: int | Rank | None
 ) -> Float[Array, " mp"]:
@@ -139,7 +140,7 @@ def _multipliers(
 
 
 def _at_saved_times(system: System, sol: DAESolution, of: Callable[..., Any]) -> Any:
-    """of(t, y, args) at each saved time."""
+    """of(system, t, y, args) at each saved time."""
     if not isinstance(sol, DAESolution):
         raise TypeError(f"`sol` must be what `daesolve` returns, but is {brief(sol)}.")
     if not isinstance(sol.ts, jax.Array):
@@ -152,7 +153,7 @@ def _at_saved_times(system: System, sol: DAESolution, of: Callable[..., Any]) ->
         if ts.ndim > 1:
             return eqx.filter_vmap(along)(ts, ys, args, changed)
         _refuse_no_states(system, ts, ys, args)
-        return at_saved_times(of, ts, ys, args, changed)
+        return at_saved_times(current(of), system, ts, ys, args, changed)
 
     return along(sol.ts, sol.ys, sol.args, sol.changed)
 

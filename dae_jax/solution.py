@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, Real
+from jaxtyping import Array, Float, PyTree, Real
 
 from ._compat import messages
 from .tables import table
@@ -142,6 +142,7 @@ class DAESolution(eqx.Module):
     - `event_mask`: which event ended the solve, if any.
     - `args`: as given; `changed`: what the resets of a `Reset` have changed of them, in their structure, as it holds at each saved time
       (a leading axis), `None` for the rest.
+    - `end`: the time and the state (t, y) at which the solve ended, saved or not, also where it failed; without derivatives.
     - `rank`: how many constraints are independent, where some are redundant, else `None`.
     - `precision`: with how many digits it was computed, and the tolerances: "float32, rtol 1e-05, atol 1e-05".
     """
@@ -158,6 +159,7 @@ class DAESolution(eqx.Module):
     rank: int | None = eqx.field(static=True, default=None)
     precision: str = eqx.field(static=True, default="")
     changed: Any = None
+    end: Any = None
 
     @property
     def final(self) -> Any:
@@ -244,12 +246,19 @@ def without_padding(ts: Float[Array, "*batch times"], ys: State) -> tuple[Any, A
     return ts[at], jax.tree.map(lambda y: y[at], ys)
 
 
+@eqx.filter_jit
 def at_saved_times(
-    of: Callable[..., Any], ts: Float[Array, "*batch times"], ys: State, args: Args, changed: Args, *more: Array
+    of: Callable[..., Any],
+    what: PyTree,
+    ts: Float[Array, "*batch times"],
+    ys: State,
+    args: Args,
+    changed: Args,
+    *more: Array,
 ) -> Any:
-    """of(t, y, *more, args) at each saved time of a solution; `more` has these along its first axis."""
+    """of(what, t, y, *more, args) at each saved time of a solution; `more` has these along its first axis."""
     ts, (ys, changed) = without_padding(ts, (ys, changed))
-    return jax.vmap(lambda t, y, c, *more: of(t, y, *more, eqx.combine(c, args)))(ts, ys, changed, *more)
+    return jax.vmap(lambda t, y, c, *more: of(what, t, y, *more, eqx.combine(c, args)))(ts, ys, changed, *more)
 
 
 def all_finite(ts: Float[Array, "*batch times"], ys: State) -> Any:

@@ -12,7 +12,7 @@ from jax.core import Tracer
 
 from .compiler.types import Arrays
 from .driver.doubts import warn
-from .driver.failures import OKAY, in_words, raised_in_the_program, undetermined
+from .driver.failures import OKAY, in_words, not_finite_beyond, raised_in_the_program, undetermined
 from .driver.options import refuse_misfits, refuse_no_event, refuse_other_steps, refuse_wrong_options
 from .driver.problem import Problem, Program, split
 from .driver.program import KEPT, Solve, run, traces
@@ -27,7 +27,7 @@ from .formulations import (
     Residual,
     why_not_as_written,
 )
-from .solution import DAESolution
+from .solution import RESULTS, DAESolution
 from .solvers import AbstractResidualSolver, SelectedResiduals, SelectedStates, takes_residuals
 from .systems import System, is_mechanism
 from .types import Args, Controller, DType, ProgressMeter, Solver, State, Time
@@ -243,5 +243,7 @@ def _raise_if_failed(sol: DAESolution, problem: Problem) -> DAESolution:
         return raised_in_the_program(sol, problem)
     if int(sol.result._value) in OKAY:
         return sol
-    said = [str(in_words(sol, problem)), not_finite(*problem.start), undetermined(sol, problem)]
+    beyond = not_finite_beyond(sol, problem)
+    sol = dataclasses.replace(sol, result=RESULTS.not_finite) if beyond else sol
+    said = [str(in_words(sol, problem)), not_finite(*problem.start) or beyond, undetermined(sol, problem)]
     raise RuntimeError(" ".join(filter(None, said)))

@@ -313,7 +313,10 @@ def _of_a_checkout(parser: argparse.ArgumentParser, package: str, arguments: lis
     if root.joinpath(*package.split("."), "__main__.py").exists():
         sys.path.insert(0, str(root))
         return importlib.import_module(f"{package}.__main__").main(arguments)
-    absent = "the benchmarks are part of the source repository, not of the installed package; run it from a checkout"
+    absent = (
+        "the benchmarks are part of the source repository, not of the installed package: in a checkout, `pip install -e .` and run "
+        "this again"
+    )
     if {"-h", "--help"} & set(arguments):
         print(f"usage: {parser.prog} [-h] ...\n\n{absent}")
         return 0

@@ -1,7 +1,9 @@
 """How a solve that failed says so: the sentence, and how it gets out of a compiled program."""
 
+import functools
 import logging
 import re
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -9,16 +11,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.core import Tracer
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from .._compat import CALLBACK_LOG, messages, unvmap_any
 from ..consistent import Violation, violation
+from ..equations.linearised import LinearisedResidual
 from ..equations.mechanical import MechanicalODE
+from ..equations.residual_form import ResidualForm
 from ..equations.singular_block import singular_block
 from ..solution import RESULTS, DAESolution
 from ..systems import is_mechanism
 from ..types import BoolScalar
-from .problem import Problem
+from ..validate.user_functions import not_finite
+from .problem import Problem, Program, split
 from .start import ADVICE
 
 
@@ -29,6 +36,17 @@ _AT_START = tuple(
 )
 
 
+_OF_A_STEP = tuple(
+    int(code._value)
+    for code in (
+        RESULTS.step_rejected, RESULTS.off_manifold, RESULTS.no_convergence, RESULTS.error_too_large,
+        RESULTS.singular_iteration_matrix, RESULTS.singular_configuration, RESULTS.not_finite, RESULTS.max_steps_reached,
+    )
+)  # fmt: skip
+# At which parts of the interval beyond its end a solve that failed is looked at.
+BEYOND = (0.0, 1e-9, 1e-6, 1e-3)
+
+
 class SolveFailed(RuntimeError):
     """A solve failed in a compiled program (`jit`, `vmap`). JAX hands it on as the last line of an error of its own."""
 
@@ -37,7 +55,10 @@ def in_words(sol: DAESolution, problem: Problem | None = None) -> str | None:
     """Why a solve failed, at which time and after how many steps, and of a known `problem` what its start violates; `None` where
     it did not.
     """
-    off = problem and _off(eqx.combine(lax.stop_gradient(eqx.filter(problem, eqx.is_array)), problem))
+    off = None
+    if problem is not None:
+        program, numbers = split(problem)
+        off = _off(program, lax.stop_gradient(numbers))
     return _sentence(tuple(map(np.asarray, lax.stop_gradient(_details(sol)))), off)
 
 
@@ -48,12 +69,33 @@ def undetermined(sol: DAESolution, problem: Problem) -> str:
     if sol.result != RESULTS.singular_iteration_matrix:
         return ""
     system, t0, y0, args = problem.start
-    points = [(t0, y0)]
-    if sol.ys is not None and jax.tree.structure(sol.ys) == jax.tree.structure(y0):
-        finite = [np.isfinite(x).reshape(len(x), -1).all(1) for x in (sol.ts, *jax.tree.leaves(sol.ys))]
-        reached = np.flatnonzero(np.all(finite, 0))[-1:]
-        points = [(sol.ts[k], jax.tree.map(lambda y, k=k: y[k], sol.ys)) for k in reached] + points
-    return next(filter(None, (singular_block(system, t, y, args) for t, y in points)), "")
+    return next(filter(None, (singular_block(system, t, y, args) for t, y in (sol.end, (t0, y0)))), "")
+
+
+def not_finite_beyond(sol: DAESolution, problem: Problem) -> str:
+    """Which functions are not finite a little beyond the point at which a solve found no next step; empty where all are."""
+    if int(sol.result._value) not in _OF_A_STEP:
+        return ""
+    constant = lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x
+    (t, y), t0, t1, (system, _, y0, args) = jax.tree.map(constant, (sol.end, sol.t0, sol.t1, problem.start))
+    if any(isinstance(x, Tracer) for x in jax.tree.leaves((t, y, args))):
+        return ""
+    # Steps that are taken whatever comes of them may have led to no state.
+    y = y if all(bool(jnp.all(jnp.isfinite(x))) for x in jax.tree.leaves(y)) else y0
+    flat, unflatten = ravel_pytree(y)
+    if is_mechanism(system):
+        slope = ravel_pytree((y[1], jax.tree.map(jnp.zeros_like, y[1])))[0]
+    else:
+        form = ResidualForm.of(system, t, y, args)
+        flat_y = form.encode(y)
+        slope = ravel_pytree(form.decode(t, LinearisedResidual.of(form, flat_y).rates(t, flat_y)))[0]
+    slope = jnp.where(jnp.isfinite(slope), slope, 0)
+    for part in BEYOND:
+        ahead = part * (t1 - t0)
+        found = not_finite(system, t + ahead, unflatten(flat + ahead * slope), args, f"just beyond t = {float(t):.6g}")
+        if found:
+            return found
+    return ""
 
 
 def _details(sol: DAESolution) -> tuple[Any, ...]:
@@ -96,15 +138,23 @@ def raised_in_the_program(sol: DAESolution, problem: Problem) -> DAESolution:
     okay = jnp.any(jnp.stack([sol.result._value == code for code in OKAY]))
     arrays, rest = eqx.partition(sol, eqx.is_array)
     details = jax.tree.map(jnp.asarray, lax.stop_gradient(_details(sol)))
-    start = lax.stop_gradient(eqx.filter(problem, eqx.is_array)), eqx.filter(problem, eqx.is_array, inverse=True)
-    return eqx.combine(_passed(arrays, ~okay, details, start), rest)
+    # Apart, as functions of the problem may close over what is traced.
+    program, numbers = split(problem)
+    start = functools.partial(_off, program)
+    return eqx.combine(_passed(arrays, ~okay, details, start, lax.stop_gradient(numbers)), rest)
 
 
 # A custom derivative, so that the branch is none in a derivative, which fails where the solve does also if only it is asked for.
 @eqx.filter_custom_jvp
-def _passed(arrays: PyTree[Array], failed: BoolScalar, details: tuple[Array, ...], start: tuple[PyTree, PyTree]) -> Any:
+def _passed(
+    arrays: PyTree[Array],
+    failed: BoolScalar,
+    details: tuple[Array, ...],
+    off: Callable[[list[Array]], Violation | None],
+    start: list[Array],
+) -> Any:
     shapes = jax.eval_shape(lambda: arrays)
-    fail = lambda: jax.pure_callback(_raise, shapes, _off(eqx.combine(*start)), *details, vmap_method="expand_dims")
+    fail = lambda: jax.pure_callback(_raise, shapes, off(start), *details, vmap_method="expand_dims")
     return lax.cond(unvmap_any(failed), fail, lambda: arrays)
 
 
@@ -114,8 +164,9 @@ def _(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
     return _passed(*primals), jax.tree.map(lambda tangent: tangent * one.astype(tangent.dtype), tangents[0])
 
 
-def _off(problem: Problem) -> Violation | None:
+def _off(program: Program, numbers: list[Array]) -> Violation | None:
     """By how much a mechanism violates its constraints at the start: worth to be computed only where a solve has failed."""
+    problem: Problem = program.whole(numbers)
     system, t, state, args = problem.start
     if not is_mechanism(system):
         return None

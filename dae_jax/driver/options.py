@@ -100,7 +100,7 @@ def refuse_misfits(formulation: AbstractFormulation, solver: diffrax.AbstractSol
         )
     if is_residual and not residuals:
         raise ValueError(
-            f"{name} needs an ODE, and {type(formulation).__name__} is none: solve it with RadauIIA5() or BDF(), or use "
+            f"{name} needs an ODE, and {type(formulation).__name__} (GGL() is one) is none: solve it with RadauIIA5() or BDF(), or use "
             f"{name} with Differentiation()."
         )
     if selects and not (residuals or is_explicit(solver)):

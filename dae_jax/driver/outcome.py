@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, PyTree
 
 from ..solution import RESULTS, DAESolution, all_finite, precision_of
 from ..solvers import takes_residuals
+from ..types import Scalar, State
 from . import doubts
 from .problem import Problem, count_of
 from .start import is_saved_part, saved_parts
@@ -20,8 +21,12 @@ if TYPE_CHECKING:
     from .program import Solve
 
 
-def judged(solve: "Solve", out: Sequence[PyTree], problem: Problem, found: tuple[PyTree, ...]) -> DAESolution:
-    """The solution, with the code of what is wrong with it; `found`: what a look at its start and its end has shown."""
+def judged(
+    solve: "Solve", out: Sequence[PyTree], problem: Problem, found: tuple[PyTree, ...], ended: tuple[Scalar, State]
+) -> DAESolution:
+    """The solution, with the code of what is wrong with it; `found`: what a look at its start and its end has shown, `ended`: where
+    that is.
+    """
     t0, t1, ts, ys, interpolation, stats, code, event_mask, (errors, passed) = out
     (start, _), end, (finite_end, defined) = found
     failed = lambda name, instead, when=True: RESULTS.where((code == name) & when, instead, code)
@@ -67,7 +72,9 @@ def judged(solve: "Solve", out: Sequence[PyTree], problem: Problem, found: tuple
             went_well, doubts.found(solve, end.drifted, stats["num_accepted_steps"], errors, passed), 0
         ),
     }
-    return DAESolution(t0, t1, ts, ys, interpolation, stats, code, event_mask, problem.args, rank, precision)
+    return DAESolution(
+        t0, t1, ts, ys, interpolation, stats, code, event_mask, problem.args, rank, precision, None, ended
+    )
 
 
 def _saved(saveat: diffrax.SaveAt, ts: PyTree[Array], ys: PyTree[Array]) -> list[tuple[Any, Any]]:

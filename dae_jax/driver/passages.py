@@ -58,7 +58,7 @@ def passages(
     if not is_mechanism(system):
         return None
     ode = MechanicalODE.of(system, t, state, args, problem.rank)
-    return Passage(ode, decode, drifts) if 0 < ode.holonomic <= MOST else None
+    return Passage(ode, decode, drifts) if 0 < ode.holonomic + ode.nonholonomic <= MOST else None
 
 
 def watched(controller: diffrax.AbstractStepSizeController, passage: Passage | Undetermined) -> "_AbstractWatchedSteps":

@@ -116,7 +116,7 @@ class Solve:
         # A yes or no has no derivative.
         found = one_kernel(check, self.derivative())(jax.lax.stop_gradient(check_arrays))
         (_, as_expected), *_ = found
-        return judged(self, fields, problem, found), as_expected
+        return judged(self, fields, problem, found, end), as_expected
 
     def keeps(self) -> tuple[bool, bool]:
         """Whether g and (ġ, h) hold at each step."""

@@ -210,14 +210,14 @@ def has_rank(ode: MechanicalODE, t: Time, y: Phase, rank: Rank | None) -> tuple[
 
 
 def passes_singularity(ode: MechanicalODE, t0: Time, y0: Phase, t1: Time, y1: Phase, drifts: bool) -> Bool[Array, ""]:
-    """Whether det(G₁ M₀⁻¹ G₀ᵀ) < 0: between two flat states, the ends of a step, the gradients of the holonomic constraints (of as
-    many as are independent) have passed a configuration in which they depend on each other, or turned by over a right angle. Of a
-    method that `drifts`, also whether the drift may have led past one.
+    """Whether det(A₁ M₀⁻¹ A₀ᵀ) < 0: between two flat states, the ends of a step, the gradients A of the constraints (of as many as are
+    independent) have passed a configuration in which they depend on each other, or turned by over a right angle. Of a method that
+    `drifts`, also whether the drift off the holonomic ones may have led past one.
     """
-    g0, g1 = _gradients(ode, t0, y0), _gradients(ode, t1, y1)
-    _, lifted, scale = _gram(ode, y0, g0)
-    turned = _is_turned(ode, row_products(g1, lifted), scale)
-    return turned | _drifted_over(ode, t1, y1, g1) if drifts else turned
+    a0, a1 = ode.constraint_jacobian(t0, *y0), ode.constraint_jacobian(t1, *y1)
+    _, lifted, scale = _gram(ode, y0, a0)
+    turned = _is_turned(row_products(a1, lifted), scale, ode.rank and ode.rank[1])
+    return turned | _drifted_over(ode, t1, y1, a1[: ode.holonomic]) if drifts and ode.holonomic else turned
 
 
 def _drifted_over(ode: MechanicalODE, t: Time, y: Phase, g: Float[Array, "m n"]) -> Bool[Array, ""]:
@@ -228,12 +228,9 @@ def _drifted_over(ode: MechanicalODE, t: Time, y: Phase, g: Float[Array, "m n"])
     gram, lifted, scale = _gram(ode, y, g)
     rank = None if ode.rank is None else ode.rank[0]
     multipliers = scale * semidefinite_solve(gram * scale[:, None] * scale, scale * ode.constraint(t, y[0]), rank)
-    change = row_products(_gradients(ode, t, (y[0] - matvec(lifted.T, multipliers), y[1])), lifted) - gram
-    return _is_turned(ode, gram + FAR * change, scale) | _is_turned(ode, gram - FAR * change, scale)
-
-
-def _gradients(ode: MechanicalODE, t: Time, y: Phase) -> Float[Array, "m n"]:
-    return jax.jacfwd(ode.constraint, 1)(t, y[0])
+    nearest = ode.constraint_jacobian(t, y[0] - matvec(lifted.T, multipliers), y[1])[: ode.holonomic]
+    change = row_products(nearest, lifted) - gram
+    return _is_turned(gram + FAR * change, scale, rank) | _is_turned(gram - FAR * change, scale, rank)
 
 
 def _gram(ode: MechanicalODE, y: Phase, g: Float[Array, "m n"]) -> tuple[Array, Array, Array]:
@@ -243,8 +240,8 @@ def _gram(ode: MechanicalODE, y: Phase, g: Float[Array, "m n"]) -> tuple[Array, 
     return gram, lifted, unit_diagonal(gram)
 
 
-def _is_turned(ode: MechanicalODE, product: Float[Array, "m m"], scale: Float[Array, " m"]) -> Bool[Array, ""]:
-    rank = len(product) if ode.rank is None else ode.rank[0]
+def _is_turned(product: Float[Array, "m m"], scale: Float[Array, " m"], rank: int | None) -> Bool[Array, ""]:
+    rank = len(product) if rank is None else rank
     return minor_sign(jax.lax.stop_gradient(product * scale[:, None] * scale), rank) < 0
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from ..consistent import consistent_state
 from ..systems import ConstrainedSystem
 from ..types import Args, Time
+from ..validate.user_functions import refuse_wrong_functions
 from .bodies import GROUND, numbers
 from .configuration import Coordinate, Coordinates
 from .joints import Joint
@@ -55,6 +56,8 @@ def assembled(
 def _closed(
     mechanism: "Mechanism", system: ConstrainedSystem, start: tuple[Coordinates, Coordinates], t0: Time, args: Args
 ) -> tuple[Coordinates, Coordinates]:
+    # What is wrong with a function is no matter of closing.
+    refuse_wrong_functions(system, t0, start, args)
     try:
         return consistent_state(system, t0, start, args)
     except ValueError as refusal:

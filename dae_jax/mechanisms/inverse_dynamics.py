@@ -68,7 +68,7 @@ def inverse_dynamics(
     taken = np.array([row for joint in leading for row in rows[joint.name][0]])
     multipliers = diagnostics.multipliers(system, sol)[:, taken]
 
-    def efforts(t: Time, y: tuple[Coordinates, Coordinates], lam: Array, args: Args) -> _Found:
+    def efforts(_: None, t: Time, y: tuple[Coordinates, Coordinates], lam: Array, args: Args) -> _Found:
         (q, v), ode = y, MechanicalODE.of(system, t, y, args)
         flat_q, flat_v = ode.encode(y)
         scale = _inverse_roots(mechanism.mass(q, args))
@@ -87,7 +87,7 @@ def inverse_dynamics(
         sizes = jnp.stack([jnp.max(jnp.abs(x)) for x in (flat_q, flat_v)])
         return _Found(tau, jnp.linalg.norm(can @ tau - wanted), jnp.linalg.norm(wanted), loads, off, sizes)
 
-    return dict(zip(motors, _checked(motors, sol, at_saved_times(sol, efforts, multipliers)).T, strict=True))
+    return dict(zip(motors, _checked(motors, sol, at_saved_times(sol, efforts, None, multipliers)).T, strict=True))
 
 
 def _checked(motors: Sequence[str], sol: DAESolution, found: _Found) -> Float[Array, "times motors"]:

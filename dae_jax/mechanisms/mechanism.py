@@ -12,6 +12,7 @@ from ..scenes.scene import Drawing
 from ..solution import DAESolution
 from ..systems import ConstrainedSystem
 from ..types import Args, Scalar, Time
+from ..validate.states import brief
 from . import assembly, outputs
 from .bodies import GROUND, Body, inertial_force, mass_block
 from .configuration import Configuration, Coordinates
@@ -49,6 +50,14 @@ class Mechanism(eqx.Module):
         joints: Sequence[AbstractJoint] = (),
         loads: Sequence[AbstractLoad | AbstractJoint] = (),
     ) -> None:
+        for name, listed in (("bodies", bodies), ("joints", joints), ("loads", loads)):
+            if not isinstance(listed, Sequence) or isinstance(listed, str):
+                raise TypeError(f"`{name}` must be a list, but is {brief(listed)}: write {name}=[...].")
+        for body in bodies:
+            if not isinstance(body, Body):
+                raise TypeError(
+                    f"`bodies` must be made by `Body`, but has {brief(body)}: the order is bodies, joints, loads."
+                )
         given = (*joints, *loads)
         self.bodies = tuple(bodies)
         # A motor whose motion is given is an equation, whatever list it is in.
@@ -63,6 +72,11 @@ class Mechanism(eqx.Module):
 
     def configuration(self, q: Coordinates, v: Coordinates | None = None) -> Configuration:
         """All bodies at one instant."""
+        if not isinstance(q, Coordinates):
+            raise TypeError(
+                f"A state of a Mechanism is a pair of `Coordinates`, as `assemble` gives it and takes it from a guess by name, but "
+                f"is {brief(q)}."
+            )
         return Configuration(self.bodies, q, v)
 
     # The equations
@@ -240,9 +254,9 @@ class Mechanism(eqx.Module):
 def _refuse_what_does_not_fit(mechanism: Mechanism, given: Sequence[AbstractJoint | AbstractLoad]) -> None:
     if not mechanism.bodies:
         raise ValueError("A mechanism needs a body.")
-    for x in (*mechanism.bodies, *given):
-        if not isinstance(x, Body | AbstractJoint | AbstractLoad):
-            raise TypeError(f"A mechanism is made of bodies, joints and loads, but {x!r} is none of them.")
+    for x in given:
+        if not isinstance(x, AbstractJoint | AbstractLoad):
+            raise TypeError(f"A mechanism is made of bodies, joints and loads, but {brief(x)} is no joint and no load.")
     names = [body.name for body in mechanism.bodies]
     for what, listed in (("bodies", names), ("joints or loads", [x.name for x in given])):
         twice = sorted({name for name in listed if listed.count(name) > 1})

@@ -1,16 +1,17 @@
 """What a mechanism's solution shows: coordinates, efforts, reactions, power."""
 
+import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Literal
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from .. import diagnostics, solution
 from ..solution import DAESolution, without_padding
 from ..types import Args, Time
+from ..validate.captured import current
 from .bodies import GROUND, wrench
 from .configuration import Configuration, Coordinate, Coordinates
 from .contacts import Coupling, Motion
@@ -51,21 +52,21 @@ def coordinate_named(mechanism: "Mechanism", name: str) -> Coordinate:
 def coordinate(mechanism: "Mechanism", sol: DAESolution, name: str) -> Float[Array, " times"]:
     """c at each saved time."""
     c = coordinate_named(mechanism, name)
-    values = _at_saved_times(mechanism, sol, lambda t, at, args: c(at))
+    values = _at_saved_times((mechanism, c), sol, _value)
     return jnp.unwrap(values) if c.kind == "angle" and mechanism.dimension == 3 else values
 
 
 def rate(mechanism: "Mechanism", sol: DAESolution, name: str) -> Float[Array, " times"]:
     """ċ at each saved time."""
     c = coordinate_named(mechanism, name)
-    return _at_saved_times(mechanism, sol, lambda t, at, args: c.with_rate(at)[1])
+    return _at_saved_times((mechanism, c), sol, _rate)
 
 
 def effort(mechanism: "Mechanism", sol: DAESolution, name: str) -> Float[Array, " times"]:
     """τ at each saved time."""
     for load in mechanism.loads:
         if load.name == name and isinstance(load, Along):
-            return _at_saved_times(mechanism, sol, load.effort)
+            return _at_saved_times((mechanism, load), sol, _effort)
     for joint in mechanism.joints:
         if joint.name == name and isinstance(joint, Motion):
             (row,), _ = mechanism.rows()[name]
@@ -90,36 +91,14 @@ def reaction(
     holonomic = multipliers.shape[-1] - sum(len(h) for _, h in rows.values())
     g_rows, h_rows = rows[name]
     lam, mu = multipliers[..., jnp.array(g_rows, int)], multipliers[..., jnp.array(h_rows, int) + holonomic]
-
-    def at_one(t: Time, y: Any, lam: Array, mu: Array, args: Args) -> tuple[Array, Array]:
-        q, v = y
-        at = mechanism.configuration(q, v)
-        _, pull = jax.vjp(lambda q: joint.constraint(t, mechanism.configuration(q), args), q)
-        _, pull_v = jax.vjp(lambda v: joint.nonholonomic(t, mechanism.configuration(q, v), args), v)
-        # Of a joint on the ground, the ground is what the first body acts on.
-        on, sign = (joint.on_b, 1.0) if joint.on_b.body != GROUND else (joint.on_a, -1.0)
-        generalised = -pull(lam)[0][on.body] - pull_v(mu)[0][on.body]
-        force, torque = wrench(q[on.body], generalised)
-        arm = joint.on_b.position(at) - at.pose(on.body).position
-        force, torque = sign * force, sign * (torque - moment(arm, force))
-        if axes == "body":
-            turn = at.pose(joint.on_b.body).rotation
-            return rotate_back(turn, force), rotate_back(turn, torque) if torque.ndim else torque
-        return force, torque
-
-    return at_saved_times(sol, at_one, lam, mu)
+    return at_saved_times(sol, functools.partial(_reaction, axes=axes), (mechanism, joint), lam, mu)
 
 
 def leading_force(mechanism: "Mechanism", sol: DAESolution, name: str) -> Float[Array, "times bodies k"]:
     """−(∂l/∂q)ᵀ λ, the generalised force on all bodies of what leads by l(t, q) = 0."""
     joint = next(joint for joint in mechanism.joints if joint.name == name)
     lam = diagnostics.multipliers(mechanism.system(), sol)[..., jnp.array(mechanism.rows()[name][0], int)]
-
-    def at_one(t: Time, y: tuple[Coordinates, Coordinates], lam: Array, args: Args) -> Array:
-        _, pull = jax.vjp(lambda q: joint.constraint(t, mechanism.configuration(q), args), y[0])
-        return -pull(lam)[0].values
-
-    return at_saved_times(sol, at_one, lam)
+    return at_saved_times(sol, _leading_force, (mechanism, joint), lam)
 
 
 def energy(mechanism: "Mechanism", sol: DAESolution) -> Float[Array, " times"]:
@@ -129,17 +108,9 @@ def energy(mechanism: "Mechanism", sol: DAESolution) -> Float[Array, " times"]:
 
 def power(mechanism: "Mechanism", sol: DAESolution) -> dict[str, Float[Array, " times"]]:
     """Q·v of each load without a potential and of what leads."""
-
-    def of_load(load: AbstractLoad) -> Callable[[Time, Configuration, Args], Array]:
-        def work(t: Time, at: Configuration, args: Args) -> Array:
-            assert at.v is not None
-            return jnp.sum(load.generalised_force(t, at, args) * at.v.values)
-
-        return work
-
     at_start = mechanism.configuration(*mechanism.reference)
     found = {
-        load.name: _at_saved_times(mechanism, sol, of_load(load))
+        load.name: _at_saved_times((mechanism, load), sol, _work)
         for load in mechanism.loads
         if load.energy(at_start) is None
     }
@@ -150,16 +121,53 @@ def power(mechanism: "Mechanism", sol: DAESolution) -> dict[str, Float[Array, " 
     return found
 
 
-def at_saved_times(sol: DAESolution, of: Callable[..., Any], *more: Array) -> Any:
-    """of(t, y, *more, args) at each saved time; `more` has these along its first axis."""
-    return _mapped(of, sol.ts, sol.ys, sol.args, sol.changed, *more)
+def _reaction(what: Any, t: Time, y: Any, lam: Array, mu: Array, args: Args, axes: str) -> tuple[Array, Array]:
+    (mechanism, joint), (q, v) = what, y
+    at = mechanism.configuration(q, v)
+    _, pull = jax.vjp(lambda q: joint.constraint(t, mechanism.configuration(q), args), q)
+    _, pull_v = jax.vjp(lambda v: joint.nonholonomic(t, mechanism.configuration(q, v), args), v)
+    # Of a joint on the ground, the ground is what the first body acts on.
+    on, sign = (joint.on_b, 1.0) if joint.on_b.body != GROUND else (joint.on_a, -1.0)
+    generalised = -pull(lam)[0][on.body] - pull_v(mu)[0][on.body]
+    force, torque = wrench(q[on.body], generalised)
+    arm = joint.on_b.position(at) - at.pose(on.body).position
+    force, torque = sign * force, sign * (torque - moment(arm, force))
+    if axes == "body":
+        turn = at.pose(joint.on_b.body).rotation
+        return rotate_back(turn, force), rotate_back(turn, torque) if torque.ndim else torque
+    return force, torque
+
+
+def _leading_force(what: Any, t: Time, y: tuple[Coordinates, Coordinates], lam: Array, args: Args) -> Array:
+    mechanism, joint = what
+    _, pull = jax.vjp(lambda q: joint.constraint(t, mechanism.configuration(q), args), y[0])
+    return -pull(lam)[0].values
+
+
+def _work(load: AbstractLoad, t: Time, at: Configuration, args: Args) -> Array:
+    assert at.v is not None
+    return jnp.sum(load.generalised_force(t, at, args) * at.v.values)
+
+
+_value = lambda c, t, at, args: c(at)
+_rate = lambda c, t, at, args: c.with_rate(at)[1]
+_effort = lambda load, t, at, args: load.effort(t, at, args)
+
+
+def at_saved_times(sol: DAESolution, of: Callable[..., Any], what: PyTree, *more: Array) -> Any:
+    """of(what, t, y, *more, args) at each saved time; `more` has these along its first axis."""
+    return solution.at_saved_times(current(of), current(what), sol.ts, sol.ys, sol.args, sol.changed, *more)
 
 
 def _at_saved_times(
-    mechanism: "Mechanism", sol: DAESolution, of: Callable[[Time, Configuration, Args], Array]
+    what: tuple["Mechanism", Any], sol: DAESolution, of: Callable[[Any, Time, Configuration, Args], Array]
 ) -> Float[Array, " times"]:
-    """of(t, configuration, args) at each saved time."""
-    return at_saved_times(sol, lambda t, y, args: of(t, mechanism.configuration(*y), args))
+    """of(part, t, configuration, args) at each saved time, for a mechanism and a part of it."""
+    return at_saved_times(sol, functools.partial(_of_part, of), what)
 
 
-_mapped = eqx.filter_jit(solution.at_saved_times)
+def _of_part(
+    of: Callable[..., Array], what: tuple["Mechanism", Any], t: Time, y: tuple[Coordinates, Coordinates], args: Args
+) -> Array:
+    mechanism, part = what
+    return of(part, t, mechanism.configuration(*y), args)

@@ -7,6 +7,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from ..validate.states import brief
 from .bodies import Body, Ground, Numbers, numbers
 from .configuration import Marker, marker
 from .rotations import frame
@@ -39,6 +40,9 @@ def markers(
 
 def dimension_of(a: Part, b: Part) -> Literal[2, 3]:
     """2 for bodies in the plane, 3 in space."""
+    for body in (a, b):
+        if not isinstance(body, Body | Ground):
+            raise TypeError(f"A joint is between two bodies, or a body and `ground`, but {brief(body)} is none.")
     found = {body.dimension for body in (a, b) if isinstance(body, Body)}
     if len(found) != 1:
         what = "one is planar and one is spatial" if found else "neither moves"

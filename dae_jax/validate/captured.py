@@ -6,10 +6,10 @@
     k = 1.0
     daesolve(system, ...)
 
-A compiled program is known by its functions. Here each of them becomes one that is equal to itself only as long as the numbers,
-arrays, containers, functions, classes and attributes of objects are that it finds in its closure, its defaults, the globals and
-modules it names, and the object that it is a method of. An object that is handed over as it is, in `args`, becomes a copy that is
-another one when what is in it has changed.
+A compiled program is known by its functions. Here each of them becomes one that is equal only to those of the same code, a `lambda`
+that is made anew for one, and only as long as the numbers, arrays, containers, functions, classes and attributes of objects are the
+same that it finds in its closure, its defaults, the globals and modules it names, and the object that it is a method of. An object
+that is handed over as it is, in `args`, becomes a copy that is another one when what is in it has changed.
 """
 
 import contextlib
@@ -30,6 +30,7 @@ from typing import Any, TypeVar
 import equinox as eqx
 import jax
 import numpy as np
+from jax.core import Tracer
 
 
 T = TypeVar("T")
@@ -48,6 +49,8 @@ _PRIMITIVE = frozenset({type(None), bool, int, float, complex, str, bytes})
 _OF_EVERY_CLASS = frozenset(
     "__dict__ __weakref__ __module__ __doc__ __qualname__ __slots__ __annotations__ __abstractmethods__ _abc_impl".split()
 )
+# Arrays of JAX with up to so many numbers are known by these, larger ones by what they are: they do not change.
+SMALL = 64
 # How many functions are remembered that have changed what is around them, and how many objects that may change.
 REMEMBERED = 1024
 _before: dict["Captured", "Captured"] = {}
@@ -86,10 +89,11 @@ def settled(leaves: Iterable[object]) -> Iterator[None]:
 
 
 class Captured:
-    """A function that is equal to itself with the same values around it."""
+    """A function that is equal to one of the same code with the same values around it: to itself, and to one that is made anew."""
 
     def __init__(self, fn: Callable[..., Any], values: Hashable) -> None:
-        self.__wrapped__, self.values = fn, values
+        self.__wrapped__, self.key = fn, (_code(fn), values)
+        self._hash = hash(self.key)
         self.__name__ = getattr(fn, "__name__", type(fn).__name__)
         self.__qualname__ = getattr(fn, "__qualname__", self.__name__)
         self.__doc__ = fn.__doc__
@@ -98,10 +102,10 @@ class Captured:
         return self.__wrapped__(*args, **kwargs)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Captured) and self.__wrapped__ == other.__wrapped__ and self.values == other.values
+        return isinstance(other, Captured) and self._hash == other._hash and self.key == other.key
 
     def __hash__(self) -> int:
-        return hash((self.__wrapped__, self.values))
+        return self._hash
 
     def __repr__(self) -> str:
         return repr(self.__wrapped__)
@@ -137,6 +141,18 @@ class Same:
         return id(self.value)
 
 
+def _code(fn: Any) -> Hashable:
+    """What a function is but for the values around it; of other callables these are all."""
+    fn = getattr(fn, "__func__", fn)
+    return (_interned(fn.__code__), Same(fn.__globals__)) if isinstance(fn, types.FunctionType) else type(fn)
+
+
+@functools.lru_cache(maxsize=4096)
+def _interned(code: types.CodeType) -> "Same":
+    """One object for all equal codes, whose hash takes no time."""
+    return Same(code)
+
+
 def values_of(fn: types.FunctionType, others: tuple[object, ...]) -> Hashable:
     """The values of the globals that a function names, and of other objects."""
     look = _Look()
@@ -163,7 +179,7 @@ def _current(x: Any) -> Any:
     if not callable(x):
         return _copied(_Look().value(x), x)
     values = _Look().of_callable(x)
-    if not values:
+    if not values and not isinstance(x, types.FunctionType):
         return x
     found = Captured(x, values)
     return _before.get(found, found) if _before else found
@@ -219,7 +235,7 @@ class _Look:
             yield from self._named(name, x, _names(code))
         for k, x in enumerate(fn.__defaults__ or ()):
             yield from self._named(f"default {k}", x)
-        for name, x in (fn.__kwdefaults__ or {}).items():
+        for name, x in ((fn.__kwdefaults__ or {}) | fn.__dict__).items():
             yield from self._named(name, x)
 
     def globals(self, fn: Any) -> Iterator[tuple[str, Hashable]]:
@@ -232,9 +248,8 @@ class _Look:
 
     def _named(self, name: str, x: object, names: tuple[str, ...] = ()) -> Iterator[tuple[str, Hashable]]:
         """A value under its name; of a module, those under `names` in it."""
-        if not isinstance(x, types.ModuleType):
-            yield name, self.value(x)
-        elif x not in self.modules and not _is_library(x.__name__):
+        yield name, self.value(x)
+        if isinstance(x, types.ModuleType) and x not in self.modules and not _is_library(x.__name__):
             self.modules.append(x)
             for attribute in names:
                 if attribute in vars(x):
@@ -249,8 +264,13 @@ class _Look:
         if isinstance(x, np.ndarray | np.generic):
             x = np.asarray(x)
             return _of_numbers(x) if x.dtype != object else (x.shape, self.value(tuple(x.ravel())))
-        if isinstance(x, jax.Array | types.ModuleType):
+        if isinstance(x, types.ModuleType):
             return Same(x)
+        if isinstance(x, jax.Array):
+            small = (
+                not isinstance(x, Tracer) and x.size <= SMALL and isinstance(x.dtype, np.dtype) and not x.is_deleted()
+            )
+            return (x.weak_type, _of_numbers(np.asarray(x))) if small else Same(x)
         if isinstance(x, type):
             return Same(x) if _is_installed(x.__module__) else self._guarded(x, self._of_class)
         if not isinstance(x, eqx.Module) and callable(x) and _of_library(x):
@@ -277,7 +297,7 @@ class _Look:
 
     def _of_parts(self, x: Any) -> Hashable:
         if isinstance(x, types.FunctionType | types.MethodType | functools.partial):
-            return Same(getattr(x, "__func__", x)), self.of_callable(x)
+            return _code(x), self.of_callable(x)
         if isinstance(x, property):
             return tuple(map(self._counted, (x.fget, x.fset)))
         if isinstance(x, staticmethod | classmethod):

@@ -22,8 +22,9 @@ def brief(x: object) -> str:
     """A short repr; a class or a function that was not called is named as such."""
     if isinstance(x, type):
         return f"the class {x.__name__}: write {x.__name__}(...)"
-    if inspect.isfunction(x):
-        return f"the function {x.__name__}"
+    function = inspect.unwrap(x) if callable(x) else x
+    if inspect.isfunction(function):
+        return f"the function {function.__name__}"
     if any(isinstance(leaf, jax.ShapeDtypeStruct) for leaf in jax.tree.leaves(x)):
         return describe(x)
     text = repr(x)
@@ -55,6 +56,8 @@ def refuse_wrong_system(system: System) -> None:
     """Refuses what is none of the three systems."""
     if not isinstance(system, AbstractSystem):
         kind = f"the class {system.__name__}" if isinstance(system, type) else f"a {type(system).__name__}"
+        if callable(getattr(system, "system", None)) and not isinstance(system, type):
+            kind += ": hand over its `.system()`"
         raise TypeError(f"`system` must be a dae_jax.ConstrainedSystem, SemiExplicitDAE or ImplicitDAE, but is {kind}.")
 
 

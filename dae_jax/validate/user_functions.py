@@ -197,7 +197,7 @@ def _all_numbers(tree: PyTree) -> bool:
     return all(isinstance(x, NUMBERS) for x in jax.tree.leaves(tree, is_leaf=lambda x: x is None))
 
 
-def not_finite(system: System, t: Time, state: State, args: Args) -> str:
+def not_finite(system: System, t: Time, state: State, args: Args, when: str = "at the start") -> str:
     """Which of a system's functions are not finite at a state, in a sentence with what may be the reason; "" if all are."""
     calls = [(call.signature, call.function, call.values) for call in system.calls(t, state, args)]
     if is_mechanism(system) and callable(system.mass):
@@ -208,7 +208,7 @@ def not_finite(system: System, t: Time, state: State, args: Args) -> str:
     if not bad:
         return ""
     reason = "; `args` holds NaN or infinity" if not _all_finite(args) else ""
-    return f"`{'`, `'.join(bad)}` {'is' if len(bad) == 1 else 'are'} not finite at the start{reason}."
+    return f"`{'`, `'.join(bad)}` {'is' if len(bad) == 1 else 'are'} not finite {when}{reason}."
 
 
 def _all_finite(tree: PyTree) -> bool:

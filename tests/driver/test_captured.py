@@ -370,11 +370,60 @@ class TestElsewhere:
         assert abs(float(after[1] - before[1])) > 0.1
 
 
-def test_what_cannot_change_costs_nothing():
-    """A function without values around it, and one of this library, stay what they are."""
+def test_a_function_of_this_library_stays_what_it_is():
     force = dae_jax.scenes.pendulum().system.force
-    assert current(circle) is circle
     assert current(force) is force
+
+
+def made(k, xp=jnp, doubled=False):
+    """A force that is made anew in each call."""
+    scale = np.array([0.0, k])
+    inner = lambda x: 2 * x if doubled else x
+    return lambda t, q, v, args: xp.asarray(inner(scale)) + 0 * q
+
+
+def test_a_function_that_is_made_anew_is_the_same_one(monkeypatch):
+    monkeypatch.setattr(program, "KEPT", np.inf)
+    assert current(made(1.0)) == current(made(1.0))
+    assert current(lambda t: t) != current(lambda t: t + 1)
+    assert current(lambda t: 1) != current(lambda t: 1.0)
+    solve = lambda *of, **options: end(ConstrainedSystem(made(*of, **options), lambda t, q, args: (q @ q - 1) / 2))
+    first, count = solve(9.81), program._jitted._cache_size()
+    assert np.array_equal(solve(9.81), first)
+    assert program._jitted._cache_size() == count
+    for others in ({"k": 1.0}, {"k": 9.81, "doubled": True}):
+        assert not np.array_equal(solve(**others), first)
+    # Another module under the name of one.
+    assert current(made(1.0, np)) != current(made(1.0, jnp))
+    with_attribute = [made(1.0), made(1.0)]
+    with_attribute[0].k = 1
+    assert current(with_attribute[0]) != current(with_attribute[1])
+    arrays = [jnp.zeros(3), jnp.zeros(3), jnp.ones(3), jnp.zeros(3, jnp.float32), jnp.zeros((3, 1))]
+    closing = lambda x: lambda: x
+    of = [current(closing(x)) for x in arrays]
+    assert [f == of[0] for f in of] == [True, True, False, False, False]
+
+
+def test_a_mechanism_that_is_made_anew_is_compiled_once(monkeypatch):
+    from dae_jax import mechanisms as m
+
+    monkeypatch.setattr(program, "KEPT", np.inf)
+
+    def angle(length, strength):
+        bar = m.Body("bar", 1.0, 0.1, at=(length, 0.0))
+        hinge = m.revolute(m.ground, bar, (0.0, 0.0), name="hinge")
+        motor = m.motor(hinge, torque=lambda t, c, rate, args: strength * jnp.sin(t) - 0.1 * rate)
+        mechanism = m.Mechanism([bar], [hinge], [motor])
+        sol = dae_jax.daesolve(mechanism.system(), SOLVER, 0.0, 1.0, None, mechanism.reference)
+        return mechanism.coordinate(sol, "hinge")[-1]
+
+    slope = jax.grad(lambda length: angle(length, 2.0))
+    first, count = slope(1.0), program._jitted._cache_size()
+    by_differences = (angle(1.1 + 1e-5, 2.0) - angle(1.1 - 1e-5, 2.0)) / 2e-5
+    assert slope(1.1) == pytest.approx(float(by_differences), rel=1e-4)
+    assert first != slope(1.1)
+    assert program._jitted._cache_size() <= count + 1  # of the differences
+    assert abs(angle(1.0, 2.0) - angle(1.0, 3.0)) > 1e-2
 
 
 def test_a_network_is_known_by_its_weights():

@@ -136,3 +136,24 @@ def test_a_number_out_of_sight_is_named():
     with pytest.raises(TypeError, match=r"Hand it over through `args`"):
         jax.grad(lambda k: last_angle(Weight(k).force))(1.1)
     assert np.isfinite(jax.jit(lambda k: last_angle(Weight(k).force))(1.1))
+
+
+@pytest.mark.parametrize(
+    "of", [jax.jit, lambda f: lambda k: jax.vmap(f)(jnp.stack([k, 2 * k]))[0]], ids=["jit", "vmap"]
+)
+def test_a_mass_in_a_derivative_that_is_compiled(of):
+    """The start is looked at again where a solve fails, masses and all."""
+
+    def height(mass, throw=True):
+        system = dae_jax.ConstrainedSystem(
+            lambda t, q, v, args: jnp.array([0.0, -9.0]),
+            lambda t, q, args: (q @ q - 1) / 2,
+            lambda q, args: jnp.stack([mass, 2 * mass]),
+        )
+        start = (jnp.array([1.0, 0.0]), jnp.array([0.0, 0.2]))
+        solver = dae_jax.OrthogonalProjection(diffrax.Tsit5())
+        return dae_jax.daesolve(system, solver, 0.0, 1.0, None, start, throw=throw).ys[0][0, 1]
+
+    np.testing.assert_allclose(of(jax.grad(height))(jnp.array(1.3)), jax.grad(height)(1.3), rtol=1e-12)
+    forward = of(lambda m: jax.jvp(height, (m,), (1.0,))[1])
+    np.testing.assert_allclose(forward(jnp.array(1.3)), jax.grad(height)(1.3), rtol=1e-9)

@@ -1,5 +1,7 @@
 """A solve that fails says so wherever it is asked for: outside and inside `jit`, in batches, and where only its derivative is used."""
 
+import math
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -58,3 +60,40 @@ class TestFails:
 def test_a_derivative_of_a_solve_that_goes_well_is_as_without_the_check():
     both = [jax.jit(jax.grad(end_of("projection", throw=throw)))(GOOD) for throw in (True, False)]
     assert jnp.array_equal(*both)
+
+
+LOST = dae_jax.ConstrainedSystem(
+    lambda t, q, v, args: jnp.where(t > 0.5, jnp.nan, jnp.array([0.0, -9.81])), lambda t, q, args: (q @ q - 1) / 2
+)
+# ẏ = −1 − √y: a tank that is empty at 2 (1 − log 2).
+TANK = dae_jax.ImplicitDAE(lambda t, y, yd, args: yd + jnp.sqrt(y) + 1)
+
+
+@pytest.mark.parametrize(
+    ("solver", "dt0"),
+    [
+        (dae_jax.OrthogonalProjection(dae_jax.DOP853()), None),
+        (dae_jax.RadauIIA5(), None),
+        (dae_jax.BDF(), None),
+        (dae_jax.RATTLE(), 0.01),
+    ],
+    ids=["projection", "radau", "bdf", "rattle"],
+)
+def test_a_function_that_is_not_finite_on_the_way_is_named(solver, dt0):
+    with pytest.raises(RuntimeError, match=r"not finite: .*`force\(t, q, v, args\)` is not finite just beyond t = 0.5"):
+        dae_jax.daesolve(LOST, solver, 0.0, 1.0, dt0, (jnp.array([1.0, 0.0]), jnp.zeros(2)))
+
+
+@pytest.mark.parametrize("solver", [dae_jax.RadauIIA5(), dae_jax.BDF(), diffrax.Tsit5()], ids=["radau", "bdf", "tsit"])
+def test_a_domain_that_is_left_is_named(solver):
+    with pytest.raises(RuntimeError, match=r"`residual\(t, y, yd, args\)` is not finite just beyond t = 0.613706"):
+        dae_jax.daesolve(TANK, solver, 0.0, 2.0, None, jnp.ones(1))
+
+
+def test_where_a_solve_ended_is_known_whatever_is_saved():
+    sol = dae_jax.daesolve(
+        TANK, diffrax.Tsit5(), 0.0, 2.0, None, jnp.ones(1), throw=False, saveat=diffrax.SaveAt(ts=jnp.array([0.1, 1.9]))
+    )
+    t, y = sol.end
+    assert float(t) == pytest.approx(2 - 2 * math.log(2), abs=1e-5)
+    assert 0 <= float(y[0]) < 1e-4

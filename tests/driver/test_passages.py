@@ -128,3 +128,20 @@ def test_sign_of_a_minor(rank):
         assert minor_sign(jnp.asarray(rows @ turned @ rows.T), rank) == expected
     assert minor_sign(jnp.array([[2.0, 5.0], [1.0, 2.0]]), 2) == -1
     assert minor_sign(jnp.array([[-3.0]]), 1) == -1
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [OrthogonalProjection(dae_jax.DOP853()), dae_jax.DOP853(), dae_jax.RadauIIA5()],
+    ids=["projection", "field", "radau"],
+)
+def test_a_nonholonomic_constraint_that_vanishes_on_the_way(solver):
+    """(x − 1) z' = 2 z x' with x' = 1: beyond x = 1 any z = c (x − 1)² will do."""
+    system = ConstrainedSystem(
+        lambda t, q, v, a: jnp.zeros(2),
+        nonholonomic=lambda t, q, v, a: jnp.stack([v[0] - 1, (q[0] - 1) * v[1] - 2 * q[1] * v[0]]),
+    )
+    solve = lambda t1: dae_jax.daesolve(system, solver, 0.0, t1, None, (jnp.array([0.0, 1.0]), jnp.array([1.0, -2.0])))
+    assert int(solve(0.9).stats["doubts"]) == 0
+    with pytest.warns(AccuracyWarning, match="constraints depend on each other"):
+        assert int(solve(2.0).stats["doubts"]) == 8

@@ -242,7 +242,7 @@ def test_a_path_of_another_shape_is_refused():
     body = m.Body("body", 1.0, 1.0)
     led = m.point_on_path(m.ground, body, path=lambda t, args: t)
     with pytest.raises(ValueError, match=r"`path\(t, args\)` must have the shape \(2,\), but has \(\)"):
-        m.Mechanism([body], [led]).rows()
+        m.Mechanism([body], [led]).assemble()
 
 
 # A load that motors reach by way of the dynamics only

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import dae_jax
 from dae_jax import mechanisms as m
 
 
@@ -90,3 +91,44 @@ def test_names_of_outputs():
     with pytest.raises(ValueError, match="no motor, spring or damper 'motor'"):
         mechanism.effort(None, "motor")
     assert np.shape(jnp.asarray(q["rod"])) == (3,)
+
+
+HINGE = m.revolute(m.ground, ROD, (0, 0), name="hinge")
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: m.Mechanism([HINGE], [ROD]), "the order is bodies, joints, loads"),
+        (lambda: m.Mechanism([ROD], [HINGE], m.gravity((0, -9.81))), r"`loads` must be a list.*write loads=\[...\]"),
+        (lambda: m.Mechanism([ROD], ["hinge"]), "'hinge' is no joint and no load"),
+        (lambda: m.revolute("ground", ROD, (0, 0)), "but 'ground' is none"),
+        (
+            lambda: dae_jax.daesolve(m.Mechanism([ROD], [HINGE]), dae_jax.DOP853(), 0.0, 1.0, None, jnp.zeros(3)),
+            r"is a Mechanism: hand over its `.system\(\)`",
+        ),
+    ],
+)
+def test_what_is_of_another_kind_is_named(make, said: str):
+    with pytest.raises(TypeError, match=said):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("load", "said"),
+    [
+        (m.motor(HINGE, torque=lambda t, c, r, args: ROD.speed * c), "AttributeError: .Body. object has no attribute"),
+        (m.motor(HINGE, torque=lambda t, c, r, args: args["T"]), r"args: None: TypeError"),
+        (m.motor(HINGE, torque=lambda t: 1.0), r"TypeError: .* takes 1 positional argument"),
+        (m.force(ROD, (0.0, 1.0, 0.0)), "must have the shape"),
+    ],
+)
+def test_what_is_wrong_with_a_load_is_no_matter_of_closing(load, said: str):
+    with pytest.raises(ValueError, match=said):
+        m.Mechanism([ROD], [HINGE], [load]).assemble()
+
+
+def test_a_state_by_name_is_told_what_a_state_is():
+    system, state = m.Mechanism([ROD], [HINGE]).system(), {"rod": jnp.zeros(3)}
+    with pytest.raises(ValueError, match="A state of a Mechanism is a pair of `Coordinates`"):
+        dae_jax.daesolve(system, dae_jax.DOP853(), 0.0, 1.0, None, (state, state))
