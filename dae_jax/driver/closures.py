@@ -21,7 +21,7 @@ from jax.core import Tracer
 from jax.tree_util import Partial
 from jaxtyping import PyTree
 
-from ..validate.captured import Same, values_of
+from ..validate.around import Same, values_of
 
 
 def opened(leaf: Any, within: tuple[Any, ...] = ()) -> Any:

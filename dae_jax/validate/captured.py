@@ -16,44 +16,24 @@ import contextlib
 import copy
 import dataclasses
 import functools
-import hashlib
-import itertools
-import marshal
-import sys
-import sysconfig
 import types
-from array import array
-from collections import deque
+import weakref
 from collections.abc import Callable, Hashable, Iterable, Iterator
 from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import numpy as np
-from jax.core import Tracer
+
+from .around import Look, Same, code_of, is_installed, of_library
 
 
 T = TypeVar("T")
 
-# Their functions and objects do not change.
-LIBRARIES = frozenset(
-    "builtins dae_jax diffrax equinox functools jax jaxlib jaxtyping lineax math numpy operator optax optimistix scipy".split()
-)
-# Containers and objects with more than so many containers and objects in them are known by what they are.
-MOST = 2000
-_CONTAINERS = frozenset({list, tuple, dict, set, frozenset, deque, array})
-# Of any size these are known by what is in them, where that is of these types.
-_PLAIN = frozenset({list, tuple, dict})
-_PRIMITIVE = frozenset({type(None), bool, int, float, complex, str, bytes})
-# What Python keeps with every class, and what changes without meaning.
-_OF_EVERY_CLASS = frozenset(
-    "__dict__ __weakref__ __module__ __doc__ __qualname__ __slots__ __annotations__ __abstractmethods__ _abc_impl".split()
-)
-# Arrays of JAX with up to so many numbers are known by these, larger ones by what they are: they do not change.
-SMALL = 64
 # How many functions are remembered that have changed what is around them, and how many objects that may change.
 REMEMBERED = 1024
 _before: dict["Captured", "Captured"] = {}
+_known: weakref.WeakValueDictionary[Hashable, "Captured"] = weakref.WeakValueDictionary()
 _copies: dict[Hashable, Any] = {}
 
 
@@ -89,10 +69,12 @@ def settled(leaves: Iterable[object]) -> Iterator[None]:
 
 
 class Captured:
-    """A function that is equal to one of the same code with the same values around it: to itself, and to one that is made anew."""
+    """All functions of the same code with the same values around them. `__wrapped__` is the one that was looked at last: what is
+    around another may have changed since.
+    """
 
-    def __init__(self, fn: Callable[..., Any], values: Hashable) -> None:
-        self.__wrapped__, self.key = fn, (_code(fn), values)
+    def __init__(self, fn: Callable[..., Any], key: Hashable) -> None:
+        self.__wrapped__, self.key = fn, key
         self._hash = hash(self.key)
         self.__name__ = getattr(fn, "__name__", type(fn).__name__)
         self.__qualname__ = getattr(fn, "__qualname__", self.__name__)
@@ -128,44 +110,13 @@ class CapturedModule:
         return self.fn
 
 
-class Same:
-    """An object that is equal to itself alone."""
-
-    def __init__(self, value: object) -> None:
-        self.value = value
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Same) and self.value is other.value
-
-    def __hash__(self) -> int:
-        return id(self.value)
-
-
-def _code(fn: Any) -> Hashable:
-    """What a function is but for the values around it; of other callables these are all."""
-    fn = getattr(fn, "__func__", fn)
-    return (_interned(fn.__code__), Same(fn.__globals__)) if isinstance(fn, types.FunctionType) else type(fn)
-
-
-@functools.lru_cache(maxsize=4096)
-def _interned(code: types.CodeType) -> "Same":
-    """One object for all equal codes, whose hash takes no time."""
-    return Same(code)
-
-
-def values_of(fn: types.FunctionType, others: tuple[object, ...]) -> Hashable:
-    """The values of the globals that a function names, and of other objects."""
-    look = _Look()
-    return tuple(look.globals(fn)), tuple(map(look.value, others))
-
-
 def _is_function_with_leaves(x: object) -> bool:
-    return isinstance(x, eqx.Module) and callable(x) and not _is_installed(type(x).__module__)
+    return isinstance(x, eqx.Module) and callable(x) and not is_installed(type(x).__module__)
 
 
 def _current(x: Any) -> Any:
     if _is_function_with_leaves(x):
-        return CapturedModule(x, _Look().value(type(x)))
+        return CapturedModule(x, Look().value(type(x)))
     if isinstance(x, Captured | CapturedModule | type | jax.Array | np.ndarray):
         return x
     if x.__hash__ is None:
@@ -174,197 +125,25 @@ def _current(x: Any) -> Any:
             f"A {name} is no pytree: JAX does not see the numbers in it. Make {name} an `equinox.Module`, register it by "
             "`jax.tree_util.register_dataclass`, or hand over a dictionary."
         )
-    if _of_library(x):
+    if of_library(x):
         return x
     if not callable(x):
-        return _copied(_Look().value(x), x)
-    values = _Look().of_callable(x)
+        return _copied(x)
+    values = Look().of_callable(x)
     if not values and not isinstance(x, types.FunctionType):
         return x
-    found = Captured(x, values)
-    return _before.get(found, found) if _before else found
+    key = code_of(x), values
+    found = _known.get(key) or _known.setdefault(key, Captured(x, key))
+    found = _before.get(found, found) if _before else found
+    found.__wrapped__ = x
+    return found
 
 
-def _copied(values: Hashable, x: Any) -> Any:
-    """An object in place of `x` that is the same one as long as the same values are in it."""
-    if values not in _copies:
-        _copies[values] = copy.copy(x)
+def _copied(x: Any) -> Any:
+    """An object in place of `x` that is the same one as long as the same is in it."""
+    key = Same(x), Look().value(x)
+    if key not in _copies:
+        _copies[key] = copy.copy(x)
         for oldest in list(_copies)[:-REMEMBERED]:
             _copies.pop(oldest)
-    return _copies[values]
-
-
-def _of_library(x: object) -> bool:
-    if isinstance(x, functools.partial):
-        return False
-    module = getattr(x, "__module__", None) or getattr(type(x), "__module__", "")
-    return isinstance(module, str) and _is_library(module)
-
-
-class _TooMuch(Exception):
-    pass
-
-
-class _Look:
-    """One look at all that a function can reach; `seen` are the objects on the way here, `modules` those looked at."""
-
-    def __init__(self) -> None:
-        self.seen: list[object] = []
-        self.modules: list[types.ModuleType] = []
-        self.count = 0
-
-    def of_callable(self, x: Any) -> Hashable:
-        """The values around a function, a method or an object with `__call__`; empty where there are none."""
-        if isinstance(x, types.FunctionType):
-            return tuple(self.around(x))
-        if isinstance(x, types.MethodType):
-            return (*self.around(x.__func__), ("self", self.value(x.__self__)))
-        if isinstance(x, functools.partial):
-            return (self.value(x.func), self.value(x.args), self.value(x.keywords))
-        return (self.value(x),) if hasattr(x, "__dict__") and not hasattr(x, "__wrapped__") else ()
-
-    def around(self, fn: Any) -> Iterator[tuple[str, Hashable]]:
-        """The values that matter, by name."""
-        yield from self.globals(fn)
-        code = fn.__code__
-        for name, cell in zip(code.co_freevars, fn.__closure__ or (), strict=True):
-            try:
-                x = cell.cell_contents
-            except ValueError:  # a name that has no value yet
-                continue
-            yield from self._named(name, x, _names(code))
-        for k, x in enumerate(fn.__defaults__ or ()):
-            yield from self._named(f"default {k}", x)
-        for name, x in ((fn.__kwdefaults__ or {}) | fn.__dict__).items():
-            yield from self._named(name, x)
-
-    def globals(self, fn: Any) -> Iterator[tuple[str, Hashable]]:
-        names, there = _names(fn.__code__), fn.__globals__
-        for name in names:
-            if name in there:
-                yield from self._named(name, there[name], names)
-            elif name in sys.modules and not _is_installed(name):  # that the function imports, perhaps
-                yield from self._named(name, sys.modules[name], names)
-
-    def _named(self, name: str, x: object, names: tuple[str, ...] = ()) -> Iterator[tuple[str, Hashable]]:
-        """A value under its name; of a module, those under `names` in it."""
-        yield name, self.value(x)
-        if isinstance(x, types.ModuleType) and x not in self.modules and not _is_library(x.__name__):
-            self.modules.append(x)
-            for attribute in names:
-                if attribute in vars(x):
-                    yield from self._named(f"{name}.{attribute}", vars(x)[attribute], names)
-
-    def value(self, x: Any) -> Hashable:
-        """What is equal as long as `x` is the same, and has the same in it."""
-        if x is None or isinstance(x, bool | int | str | bytes | complex):
-            return type(x), x
-        if isinstance(x, float):
-            return float, x.hex()
-        if isinstance(x, np.ndarray | np.generic):
-            x = np.asarray(x)
-            return _of_numbers(x) if x.dtype != object else (x.shape, self.value(tuple(x.ravel())))
-        if isinstance(x, types.ModuleType):
-            return Same(x)
-        if isinstance(x, jax.Array):
-            small = (
-                not isinstance(x, Tracer) and x.size <= SMALL and isinstance(x.dtype, np.dtype) and not x.is_deleted()
-            )
-            return (x.weak_type, _of_numbers(np.asarray(x))) if small else Same(x)
-        if isinstance(x, type):
-            return Same(x) if _is_installed(x.__module__) else self._guarded(x, self._of_class)
-        if not isinstance(x, eqx.Module) and callable(x) and _of_library(x):
-            return Same(x)
-        return self._guarded(x, self._of_parts)
-
-    def _guarded(self, x: object, look: Callable[[Any], Hashable]) -> Hashable:
-        if any(x is outer for outer in self.seen):
-            return "within itself"
-        if not self.seen:
-            self.count = 0
-        before = self.count
-        self.seen.append(x)
-        try:
-            return look(x)
-        except _TooMuch:
-            # What is large itself is known by what it is, what is beside it by what is in that.
-            if len(self.seen) > 1 and self.count - before < MOST // 2:
-                raise
-            self.count = before + MOST // 20
-            return Same(x)
-        finally:
-            self.seen.pop()
-
-    def _of_parts(self, x: Any) -> Hashable:
-        if isinstance(x, types.FunctionType | types.MethodType | functools.partial):
-            return _code(x), self.of_callable(x)
-        if isinstance(x, property):
-            return tuple(map(self._counted, (x.fget, x.fset)))
-        if isinstance(x, staticmethod | classmethod):
-            return self._counted(x.__func__)
-        found: list[Hashable] = []
-        if type(x) in _PLAIN and len(x) > MOST // 20 and _PRIMITIVE.issuperset(map(type, _entries(x))):
-            return type(x), hashlib.blake2b(marshal.dumps(x, 2)).digest()
-        if isinstance(x, dict | types.MappingProxyType):
-            found += [(Same(k) if k.__hash__ is None else k, self._counted(y)) for k, y in x.items()]
-        elif isinstance(x, set | frozenset):
-            found.append(frozenset(map(self._counted, x)))
-        elif isinstance(x, list | tuple | deque | array):
-            found += map(self._counted, x)
-        of_library = _of_library(x) and not isinstance(x, eqx.Module)
-        attributes = {} if of_library else _attributes(x)
-        if not found and not attributes and type(x) not in _CONTAINERS:
-            return Same(x), self.value(type(x))
-        found += [(name, self._counted(y)) for name, y in attributes.items()]
-        return self.value(type(x)), *found
-
-    def _of_class(self, x: type) -> Hashable:
-        own = ((name, y) for name, y in vars(x).items() if name not in _OF_EVERY_CLASS)
-        return Same(x), *((name, self._counted(y)) for name, y in own), *map(self._counted, x.__bases__)
-
-    def _counted(self, x: object) -> Hashable:
-        self.count += 1
-        if self.count > MOST:
-            raise _TooMuch
-        return self.value(x)
-
-
-def _attributes(x: object) -> dict[str, Any]:
-    """An object's own attributes, also those that its classes have slots for."""
-    slots = [name for of in type(x).__mro__ for name in _tuple(vars(of).get("__slots__", ()))]
-    found = {name: getattr(x, name) for name in slots if name not in _OF_EVERY_CLASS and hasattr(x, name)}
-    return found | getattr(x, "__dict__", {})
-
-
-def _entries(x: Any) -> Iterable[object]:
-    return itertools.chain(x.keys(), x.values()) if type(x) is dict else x
-
-
-def _tuple(x: Any) -> tuple[str, ...]:
-    return (x,) if isinstance(x, str) else tuple(x)
-
-
-@functools.cache
-def _is_library(module: str) -> bool:
-    return module.partition(".")[0] in LIBRARIES
-
-
-@functools.cache
-def _is_installed(module: str) -> bool:
-    """Whether the classes of a module come with Python or with a package: they do not change."""
-    place = getattr(sys.modules.get(module), "__file__", None)
-    if _is_library(module) or module in sys.stdlib_module_names or "site-packages" in str(place):
-        return True
-    return str(place).startswith(sysconfig.get_path("stdlib"))
-
-
-def _of_numbers(x: np.ndarray) -> Hashable:
-    bits = x.tobytes()
-    return x.shape, x.dtype.str, bits if len(bits) <= 64 else hashlib.blake2b(bits).digest()
-
-
-@functools.lru_cache(maxsize=1024)
-def _names(code: types.CodeType) -> tuple[str, ...]:
-    """The names that a function, and those that are written in it, may look up."""
-    within = (name for x in code.co_consts if isinstance(x, types.CodeType) for name in _names(x))
-    return tuple(dict.fromkeys((*code.co_names, *within)))
+    return _copies[key]

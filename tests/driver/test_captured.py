@@ -404,6 +404,26 @@ def test_a_function_that_is_made_anew_is_the_same_one(monkeypatch):
     assert [f == of[0] for f in of] == [True, True, False, False, False]
 
 
+def test_what_is_made_anew_is_not_taken_for_one_that_has_changed_since():
+    """A derivative may be traced later than the value, when what is around the first of two equal functions is another."""
+
+    def pulled(table):
+        return lambda t, q, v, args: table["k"]
+
+    def held(table):
+        found = Held(0.0)
+        found.deeper = table
+        return found
+
+    first, second = {"k": 9.0}, {"k": 9.0}
+    by_first, of_first = current(pulled(first)), current(held(first))
+    first["k"] = 1.0
+    by_second, of_second = current(pulled(second)), current(held(second))
+    assert by_first == by_second
+    assert by_first(0.0, None, None, None) == by_second(0.0, None, None, None) == 9.0
+    assert (of_first.deeper["k"], of_second.deeper["k"]) == (1.0, 9.0)
+
+
 def test_a_mechanism_that_is_made_anew_is_compiled_once(monkeypatch):
     from dae_jax import mechanisms as m
 
