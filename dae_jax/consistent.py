@@ -1,25 +1,23 @@
 """Consistent initial states: how far a state is off, and the nearest one that is not."""
 
-import operator
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
-from .equations.constraint_jacobian import Rank, mass_solve
+from .equations.constraint_jacobian import mass_solve
 from .equations.initial_rates import is_nonlinear, rates_of
 from .equations.linearised import LinearisedResidual
 from .equations.mechanical import MechanicalODE
-from .equations.regularity import DRIFTED, LARGE, has_rank, is_near_constraints, mass_is_regular, weakest
 from .equations.residual_form import ResidualForm
 from .equations.structural_ode import StructuralODE
 from .linalg import fixed_point, implicit_root, relative_change
 from .systems import ConstrainedSystem, System, is_mechanism
-from .types import Args, Phase, Scalar, State, Time
+from .types import Args, Phase, State, Time
 from .validate.captured import current
 from .validate.states import broadcast_to_state, refuse_wrong_state, with_rates
 from .validate.user_functions import refuse_wrong_functions
@@ -27,10 +25,6 @@ from .validate.user_functions import refuse_wrong_functions
 
 # How many equations a message lists.
 LISTED = 12
-# What part of the interval a solve that failed is looked on beyond its end; and the second and third power of it.
-AHEAD = 1e-3
-# A smallest pivot below this power of round-off is that of constraints that become dependent.
-SINGULAR = 1 / 3
 
 
 class Violation(eqx.Module):
@@ -124,78 +118,6 @@ def unsolved(system: System, t: Time, state: State, args: Args) -> Unsolved:
 def _left_over(ode: StructuralODE, t: Time, y: Float[Array, " N"]) -> Unsolved:
     terms = ode.sizes(t, y) * (1 + jnp.max(jnp.abs(y)))
     return Unsolved(ode.violations(t, y), jnp.finfo(y.dtype).eps ** 0.5 * terms, ode.invariant_names)
-
-
-class Start(NamedTuple):
-    """What is wrong with a start: 0 for nothing, 1: it is inconsistent, 2: the constraints have not the given rank (`None`:
-    all are independent), 3: the masses, 4: several ẏ satisfy the equations; and whether nothing is wrong beyond doubt.
-    """
-
-    wrong: Int[Array, ""]
-    surely: Bool[Array, ""]
-
-
-class End(NamedTuple):
-    """What the state at the end of a solve says: whether it satisfies the equations as far as to have any meaning (see
-    `is_near_constraints`); of a mechanism, whether constraints nearly depend on each other; whether the masses are regular
-    there, and also beyond, where a solve that failed did not get. `drifted`: whether it is off the equations by more than the
-    tolerances.
-    """
-
-    near: Bool[Array, ""]
-    singular: Bool[Array, ""]
-    masses: Bool[Array, ""]
-    masses_ahead: Bool[Array, ""]
-    drifted: Bool[Array, ""]
-
-
-def look(
-    system: System,
-    t0: Time,
-    start: State,
-    args: Args,
-    rank: int | Rank | None,
-    invertible: bool,
-    end: tuple[Scalar, State],
-    keeps: tuple[bool, bool],
-    tolerances: tuple[Time, Time],
-    residual: bool,
-) -> tuple[Start, End]:
-    """The start and the `end` (t, y) of a solve. `invertible`: whether M must be."""
-    if not is_mechanism(system):
-        return _look_at_equations(system, t0, start, args, end, tolerances)
-    ode = MechanicalODE.of(system, t0, start, args, rank)
-    y, (t, y_end) = ode.encode(start), (end[0], ode.encode(end[1]))
-    consistent, regular = violation(ode, t0, y).consistent(), mass_is_regular(ode, y[0], invertible)
-    fits, surely = has_rank(ode, t0, y, ode.rank)
-    wrong = jnp.where(regular, jnp.where(consistent, jnp.where(fits, 0, 2), 1), 3)
-    at_start = Start(wrong, (wrong == 0) & surely)
-
-    near, drifted = is_near_constraints(ode, t, y, y_end, keeps, tolerances, residual)
-    yes = jnp.asarray(True)
-    singular = ~yes if ode.rank else weakest(ode, t, y_end) < jnp.finfo(t.dtype).eps ** SINGULAR
-    if not callable(system.mass):
-        return at_start, End(near, singular, yes, yes, drifted)
-    (q, v), finite = y_end, jnp.all(jnp.isfinite(y_end[0]))
-    regular = lambda q: mass_is_regular(ode, q, invertible) | ~finite
-    ahead = [regular(q + AHEAD**k * (t - t0) * v) for k in (1, 2, 3)]
-    return at_start, End(near, singular, regular(q), ahead[0] & ahead[1] & ahead[2], drifted)
-
-
-def _look_at_equations(
-    system: System, t0: Time, start: State, args: Args, end: tuple[Scalar, State], tolerances: tuple[Time, Time]
-) -> tuple[Start, End]:
-    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(end)]))
-    both = jax.tree.map(lambda a, b: jnp.stack([a, jnp.where(finite, b, a)]), (jnp.asarray(t0), start), end)
-    # One after the other, so that it is compiled once.
-    left = jax.lax.map(lambda at: unsolved(system, at[0], at[1], args), both)
-    at_start, at_end = (jax.tree.map(operator.itemgetter(k), left) for k in (0, 1))
-    consistent, off = at_start.consistent(), at_end.as_part()
-    wrong = jnp.where(consistent, jnp.where(at_start.several, 4, 0), 1)
-    rtol, atol = tolerances
-    drifted = (off > jnp.finfo(off.dtype).eps ** 0.5 + DRIFTED * (rtol + atol)) & (rtol + atol > 0)
-    no = jnp.asarray(False)
-    return Start(wrong, wrong == 0), End(~(off > LARGE), no, ~no, ~no, drifted)
 
 
 def consistent_state(

@@ -12,11 +12,12 @@ from jax.core import Tracer
 
 from .compiler.types import Arrays
 from .driver.doubts import warn
+from .driver.event_functions import refuse_other_outputs
 from .driver.failures import OKAY, in_words, not_finite_beyond, raised_in_the_program, undetermined
 from .driver.options import refuse_misfits, refuse_no_event, refuse_other_steps, refuse_wrong_options
 from .driver.problem import Problem, Program, split
 from .driver.program import KEPT, Solve, run, traces
-from .driver.resets import Reset, refuse_other_outputs
+from .driver.resets import Reset
 from .driver.start import as_array, checked, refuse_bad_start, refuse_bad_times
 from .equations.residual_form import LARGE, Form
 from .formulations import (

@@ -14,7 +14,6 @@ from jaxtyping import PyTree
 from .._compat import is_captured, trace_state_clean
 from ..compiler import PullBack, inexact, one_kernel, waiting
 from ..compiler.types import Arrays
-from ..consistent import look
 from ..equations.regularity import COARSE
 from ..formulations import AbstractFormulation
 from ..solution import DAESolution
@@ -23,9 +22,11 @@ from ..types import Scalar, State
 from ..validate.captured import settled
 from ..validate.user_functions import refuse_wrong_functions, returned
 from .diffrax_call import Decode, View, call
+from .ends import look
+from .event_functions import refuse_wrong_event
 from .outcome import judged
 from .problem import Problem, Program, Split, split
-from .resets import Reset, refuse_wrong_event, solve_with_resets
+from .resets import Reset, solve_with_resets
 from .start import saved_parts
 from .trajectory_adjoint import Taped, can_be_taped, cotangents, recorded, saved_times
 

@@ -9,7 +9,6 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optimistix
 from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
@@ -22,9 +21,8 @@ from ..equations.constraint_jacobian import Rank
 from ..equations.structural_ode import underlying_ode
 from ..solution import RESULTS, DAESolution, precision_of
 from ..systems import System
-from ..types import Args, BoolLike, Scalar, State, Time, Y
-from ..validate.states import NUMBERS, brief, broadcast_to_state, describe
-from ..validate.user_functions import refuse_other_arguments, returned
+from ..types import Args, Scalar, State, Time, Y
+from ..validate.states import NUMBERS, brief
 from .problem import Problem, Split, count_of, split
 from .start import saved_parts
 
@@ -88,63 +86,6 @@ def Jump(
     """The former name of `Reset`."""
     warnings.warn("`Jump(..., most=...)` is called `Reset(..., max_resets=...)` now.", DeprecationWarning, stacklevel=2)
     return Reset(condition, jump, direction, fixed, most)
-
-
-def refuse_wrong_event(event: diffrax.Event | Reset | None, t: Time, y: State, args: Args) -> None:
-    """Refuses functions of an event that cannot be called with (t, y, args), or do not return what they must."""
-    if event is None:
-        return
-    conditions = [event.condition] if isinstance(event, Reset) else jax.tree.leaves(event.cond_fn, is_leaf=callable)
-    for condition in conditions:
-        # A boolean that stays true is no event of which there is one.
-        _refuse_wrong_condition(condition, t, y, args, "f" if isinstance(event, Reset) else "fb")
-    if isinstance(event, Reset):
-        _refuse_wrong_reset(event, t, y, args)
-
-
-def _refuse_wrong_condition(
-    condition: Callable[..., Time | BoolLike], t: Time, y: State, args: Args, kinds: str
-) -> None:
-    refuse_other_arguments("condition(t, y, args, **kwargs)", condition, 3, terms=None, solver=None, t0=None, t1=None)
-    found = returned("condition(t, y, args, **kwargs)", condition, t, y, args)
-    fits = isinstance(found, NUMBERS) and jnp.shape(found) == ()
-    if not fits or np.dtype(jnp.result_type(found)).kind not in kinds:
-        raise ValueError(
-            "`condition(t, y, args, **kwargs)` must return a real number, whose zero is the event, but returns "
-            f"{describe(found)}."
-        )
-
-
-def _refuse_wrong_reset(event: Reset, t: Time, y: State, args: Args) -> None:
-    found = returned("reset(t, y, args)", event.reset, t, y, args)
-    shapes = lambda tree: (jax.tree.structure(tree), [jnp.shape(x) for x in jax.tree.leaves(tree)])
-    if not isinstance(found, tuple | list) or len(found) != 2 or shapes(tuple(found)) != shapes((y, args)):
-        raise ValueError(
-            f"`reset(t, y, args)` must return (y, args), the state and the args to go on with, {describe((y, args))}, but "
-            f"returns {describe(found)}."
-        )
-    for x, before in zip(jax.tree.leaves(found[1]), jax.tree.leaves(args), strict=True):
-        if not isinstance(before, NUMBERS):
-            if x is not before:
-                raise ValueError(
-                    f"`reset(t, y, args)` changes {brief(before)} in `args`, which is no number, to {brief(x)}."
-                )
-        elif not np.can_cast(jnp.result_type(x), jnp.result_type(before), "same_kind"):
-            raise ValueError(
-                f"`reset(t, y, args)` returns {describe(x)} for an entry of `args` that is {describe(before)}: it would be cut off. "
-                "Start with 1.0 in place of 1."
-            )
-    if event.fixed is not None:
-        broadcast_to_state("fixed", event.fixed, y, "booleans")
-
-
-def refuse_other_outputs(saveat: diffrax.SaveAt) -> None:
-    """Refuses what cannot be put together from the parts of a solve with resets."""
-    parts = saved_parts(saveat)
-    if len(parts) != 1 or parts[0].steps or saveat.dense or saveat.solver_state or saveat.controller_state:
-        raise ValueError(
-            "A solve with a Reset saves SaveAt(t0=..., ts=..., t1=..., fn=...) only, no steps or dense output."
-        )
 
 
 class _FromStart(eqx.Module):
