@@ -13,7 +13,7 @@ from jax.core import Tracer
 from .compiler.types import Arrays
 from .driver.doubts import warn
 from .driver.event_functions import refuse_other_outputs
-from .driver.failures import OKAY, in_words, not_finite_beyond, raised_in_the_program, undetermined
+from .driver.failures import OKAY, below_roundoff, in_words, not_finite_beyond, raised_in_the_program, undetermined
 from .driver.options import refuse_misfits, refuse_no_event, refuse_other_steps, refuse_wrong_options
 from .driver.problem import Problem, Program, split
 from .driver.program import KEPT, Solve, run, traces
@@ -105,7 +105,7 @@ def daesolve(
         sol = _run_on_numbers(program, arrays, solve, problem)
     if traces() != before:
         settle(program.leaves)
-    sol = _raise_if_failed(sol, problem) if throw else sol
+    sol = _raise_if_failed(sol, solve, problem) if throw else sol
     if not isinstance(sol.stats["doubts"], Tracer):
         warn(sol, stacklevel=2)
     return sol
@@ -239,12 +239,13 @@ _UNDERLYING_ODE = Differentiation()
 _PID64, _PID32 = (diffrax.PIDController(rtol=tolerance, atol=tolerance) for tolerance in (1e-8, 1e-5))
 
 
-def _raise_if_failed(sol: DAESolution, problem: Problem) -> DAESolution:
+def _raise_if_failed(sol: DAESolution, solve: Solve, problem: Problem) -> DAESolution:
     if isinstance(sol.result._value, Tracer):
         return raised_in_the_program(sol, problem)
     if int(sol.result._value) in OKAY:
         return sol
     beyond = not_finite_beyond(sol, problem)
     sol = dataclasses.replace(sol, result=RESULTS.not_finite) if beyond else sol
-    said = [str(in_words(sol, problem)), not_finite(*problem.start) or beyond, undetermined(sol, problem)]
+    unmet = below_roundoff(sol, solve.controller)
+    said = [str(in_words(sol, problem)), not_finite(*problem.start) or beyond or unmet, undetermined(sol, problem)]
     raise RuntimeError(" ".join(filter(None, said)))

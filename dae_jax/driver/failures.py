@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable
 from typing import Any
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -96,6 +97,23 @@ def not_finite_beyond(sol: DAESolution, problem: Problem) -> str:
         if found:
             return found
     return ""
+
+
+def below_roundoff(sol: DAESolution, controller: diffrax.AbstractStepSizeController) -> str:
+    """That no step can meet the tolerances, where that is so at the end of a solve that found none; else empty."""
+    tolerances = [jax.tree.leaves(lax.stop_gradient(getattr(controller, name, None))) for name in ("rtol", "atol")]
+    state = jax.tree.leaves(lax.stop_gradient(sol.end[1]))
+    known = all(tolerances) and not any(isinstance(x, Tracer) for x in jax.tree.leaves((tolerances, state)))
+    if int(sol.result._value) not in _OF_A_STEP or not known:
+        return ""
+    rtol, atol = (min(float(np.min(x)) for x in of) for of in tolerances)
+    size, eps = max(float(np.max(np.abs(x), initial=0)) for x in state), float(np.finfo(state[0].dtype).eps)
+    if not rtol * size + atol < eps * size:
+        return ""
+    return (
+        f"The tolerances, rtol = {rtol:.3g} and atol = {atol:.3g}, are below round-off, which is {eps:.2g} of a number: no step meets "
+        "them."
+    )
 
 
 def _details(sol: DAESolution) -> tuple[Any, ...]:

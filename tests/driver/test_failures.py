@@ -97,3 +97,10 @@ def test_where_a_solve_ended_is_known_whatever_is_saved():
     t, y = sol.end
     assert float(t) == pytest.approx(2 - 2 * math.log(2), abs=1e-5)
     assert 0 <= float(y[0]) < 1e-4
+
+
+@pytest.mark.parametrize("solver", [diffrax.Tsit5(), dae_jax.RadauIIA5()], ids=["explicit", "radau"])
+def test_tolerances_below_roundoff_are_said_to_be_so(solver):
+    options = {"stepsize_controller": diffrax.PIDController(rtol=1e-18, atol=1e-18), "max_steps": 50}
+    with pytest.raises(RuntimeError, match=r"rtol = 1e-18 and atol = 1e-18, are below round-off, which is 2\.2e-16"):
+        dae_jax.daesolve(TANK, solver, 0.0, 0.5, None, jnp.ones(1), **options)
