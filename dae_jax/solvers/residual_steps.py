@@ -170,18 +170,15 @@ class Iteration(NamedTuple):
     combined: Callable[[Any], Any]
     round_off: Any
 
-    def next(self, x: Any) -> Any:
-        """The correction at x."""
-        return self.correction(self.residual(x))
-
-    def after(self, x: Any, dx: Any, allowed: Any = LEFT) -> tuple[Any, Any]:
+    def after(self, x: Any, dx: Any, before: Any, allowed: Any = LEFT) -> tuple[Any, Any]:
         """F at x, and whether the size of the correction Δx that led there says how far the solution is: by a matrix from
         where F was steep it is small wherever that is. Each equation has to be one that about as much more of Δx puts right,
-        by its slope at x (at most `allowed` of it), or right to round-off.
+        by its slope at x or by what Δx has changed of F `before` (at most `allowed` of it), or right to round-off.
         """
         left, change = jax.jvp(self.residual, (x,), (dx,))
-        rows, changes = self.combined(left), self.combined(change)
-        return left, jnp.all(jnp.abs(rows) <= jnp.maximum(allowed * jnp.abs(changes), self.round_off))
+        rows, changes, changed = map(self.combined, (left, change, left - before))
+        moved = allowed * jnp.maximum(jnp.abs(changes), jnp.abs(changed))
+        return left, jnp.all(jnp.abs(rows) <= jnp.maximum(moved, self.round_off))
 
 
 def simplified_newton(iteration: Iteration, start: Any, scale: Any, eta: Any, tol: Tolerances) -> Newton:
@@ -201,7 +198,7 @@ def simplified_newton(iteration: Iteration, start: Any, scale: Any, eta: Any, to
         x = s.x + dx
         size = rms_norm(dx * scale)
         allowed = jnp.minimum(jnp.where(s.count == 0, FIRST_LEFT, LEFT), UNSOLVED / size)
-        left, trusted = iteration.after(x, dx, allowed)
+        left, trusted = iteration.after(x, dx, off, allowed)
         theta = size / jnp.maximum(s.last, jnp.finfo(start.dtype).tiny)
         first = s.count == 0
         eta = jnp.where(first, jnp.maximum(s.eta, 1e-3) ** 0.8, theta / jnp.maximum(1 - theta, epsilon))
@@ -245,13 +242,14 @@ def corrected(
 
     Source: P. Deuflhard, *Newton Methods for Nonlinear Problems*, sec. 3.1.4 (the restricted monotonicity test).
     """
-    dx = iteration.next(x)
+    off = iteration.residual(x)
+    dx = iteration.correction(off)
     scale_there = scale(x + dx)
     size = rms_norm(dx * scale_there)
 
     def halve(carry: Any) -> Any:
         part, *_, count = carry
-        left, trusted = iteration.after(x + part * dx, dx)
+        left, trusted = iteration.after(x + part * dx, dx, off)
         ahead = rms_norm(iteration.correction(left) * scale_there)
         taken = (tries > DAMPED) | (ahead <= (1 - part / 2) * size)
         return jnp.where(taken, part, part / 2), ahead, taken, trusted, count + 1

@@ -50,6 +50,15 @@ def test_order_five():
     assert np.log2(error(0.04) / error(0.02)) > 4.6
 
 
+def test_fixed_steps_of_any_size_get_to_round_off():
+    """What is left of an equation there has no slope: one in ten sizes ended without convergence."""
+    for steps in range(20, 320, 3):
+        sol = dae_jax.daesolve(
+            PENDULUM.system, dae_jax.RadauIIA5(), 0.0, 0.8, 0.8 / steps, PENDULUM.y0, formulation=DUMMY, throw=False
+        )
+        assert sol.result == dae_jax.RESULTS.successful, steps
+
+
 def test_index_five_which_is_beyond_methods_for_the_equations_as_written():
     scene = SCENES["integrators-5"]()
     with pytest.raises(ValueError, match="index up to 2"):
