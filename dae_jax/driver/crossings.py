@@ -14,6 +14,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..formulations import AbstractFormulation
+from ..solvers.residual_steps import constant
 from ..solvers.wrapping import AbstractWrapper
 from ..types import Args, BoolLike, Scalar, Time, Y
 
@@ -74,9 +75,7 @@ class OneCrossing(AbstractWrapper):
     ) -> Any:
         y1, error, dense_info, solver_state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
         if error is not None:
-            constant = lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x
-            of = (self, (t0, y0), (t1, y1), dense_info, args)
-            self, start, end, dense, equations = jax.tree.map(constant, of)
+            self, start, end, dense, equations = constant((self, (t0, y0), (t1, y1), dense_info, args))
             path = self.solver.interpolation_cls(t0=start[0], t1=end[0], **dense)
             times = start[0] + (end[0] - start[0]) * jnp.arange(1, POINTS + 1) / (POINTS + 1)
             at = lambda t, y: jnp.stack([c(t, y, equations) for c in self.conditions])

@@ -23,6 +23,7 @@ from ..equations.mechanical import MechanicalODE
 from ..equations.residual_form import ResidualForm
 from ..equations.singular_block import singular_block
 from ..solution import RESULTS, DAESolution
+from ..solvers.residual_steps import constant
 from ..systems import is_mechanism
 from ..types import BoolScalar
 from ..validate.user_functions import not_finite
@@ -77,8 +78,7 @@ def not_finite_beyond(sol: DAESolution, problem: Problem) -> str:
     """Which functions are not finite a little beyond the point at which a solve found no next step; empty where all are."""
     if int(sol.result._value) not in _OF_A_STEP:
         return ""
-    constant = lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x
-    (t, y), t0, t1, (system, _, y0, args) = jax.tree.map(constant, (sol.end, sol.t0, sol.t1, problem.start))
+    (t, y), t0, t1, (system, _, y0, args) = constant((sol.end, sol.t0, sol.t1, problem.start))
     if any(isinstance(x, Tracer) for x in jax.tree.leaves((t, y, args))):
         return ""
     # Steps that are taken whatever comes of them may have led to no state.

@@ -72,9 +72,7 @@ def judged(
             went_well, doubts.found(solve, end.drifted, stats["num_accepted_steps"], errors, passed), 0
         ),
     }
-    return DAESolution(
-        t0, t1, ts, ys, interpolation, stats, code, event_mask, problem.args, rank, precision, None, ended
-    )
+    return DAESolution(t0, t1, ts, ys, interpolation, stats, code, event_mask, problem.args, rank, precision, end=ended)
 
 
 def _saved(saveat: diffrax.SaveAt, ts: PyTree[Array], ys: PyTree[Array]) -> list[tuple[Any, Any]]:

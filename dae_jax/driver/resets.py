@@ -203,20 +203,9 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Any]:
     precision = precision_of(t0.dtype, solve.controller)
     along = jax.tree.unflatten(jax.tree.structure(eqx.filter(numbers, changes)), p.changed)
     sol = DAESolution(
-        t0,
-        t1,
-        p.ts,
-        p.ys,
-        None,
-        stats,
-        result,
-        None,
-        args,
-        count_of(rank),
-        precision,
-        along,
-        lax.stop_gradient((p.t, p.y)),
-    )
+        t0, t1, p.ts, p.ys, None, stats, result, None, args, count_of(rank), precision,
+        changed=along, end=lax.stop_gradient((p.t, p.y)),
+    )  # fmt: skip
     refused = (
         RESULTS.inconsistent_start,
         RESULTS.dependent_constraints,

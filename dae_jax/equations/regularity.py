@@ -228,8 +228,8 @@ def _drifted_over(ode: MechanicalODE, t: Time, y: Phase, g: Float[Array, "m n"])
     gram, lifted, scale = _gram(ode, y, g)
     rank = None if ode.rank is None else ode.rank[0]
     multipliers = scale * semidefinite_solve(gram * scale[:, None] * scale, scale * ode.constraint(t, y[0]), rank)
-    nearest = ode.constraint_jacobian(t, y[0] - matvec(lifted.T, multipliers), y[1])[: ode.holonomic]
-    change = row_products(nearest, lifted) - gram
+    nearest = y[0] - matvec(lifted.T, multipliers)
+    change = row_products(jax.jacfwd(ode.constraint, 1)(t, nearest), lifted) - gram
     return _is_turned(gram + FAR * change, scale, rank) | _is_turned(gram - FAR * change, scale, rank)
 
 

@@ -53,11 +53,6 @@ class Mechanism(eqx.Module):
         for name, listed in (("bodies", bodies), ("joints", joints), ("loads", loads)):
             if not isinstance(listed, Sequence) or isinstance(listed, str):
                 raise TypeError(f"`{name}` must be a list, but is {brief(listed)}: write {name}=[...].")
-        for body in bodies:
-            if not isinstance(body, Body):
-                raise TypeError(
-                    f"`bodies` must be made by `Body`, but has {brief(body)}: the order is bodies, joints, loads."
-                )
         given = (*joints, *loads)
         self.bodies = tuple(bodies)
         # A motor whose motion is given is an equation, whatever list it is in.
@@ -254,6 +249,11 @@ class Mechanism(eqx.Module):
 def _refuse_what_does_not_fit(mechanism: Mechanism, given: Sequence[AbstractJoint | AbstractLoad]) -> None:
     if not mechanism.bodies:
         raise ValueError("A mechanism needs a body.")
+    for body in mechanism.bodies:
+        if not isinstance(body, Body):
+            raise TypeError(
+                f"`bodies` must be made by `Body`, but has {brief(body)}: the order is bodies, joints, loads."
+            )
     for x in given:
         if not isinstance(x, AbstractJoint | AbstractLoad):
             raise TypeError(f"A mechanism is made of bodies, joints and loads, but {brief(x)} is no joint and no load.")
