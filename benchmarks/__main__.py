@@ -7,7 +7,7 @@ from pathlib import Path
 
 from dae_jax.app.options import writable
 
-from . import chain, cost, jit, large, stiff, sweep, timing, work_precision
+from . import chain, cost, gpu, jit, large, stiff, sweep, timing, work_precision
 from .peers import NAMES, PACKAGES, load
 
 
@@ -19,14 +19,17 @@ PARTS = {
     "stiff": stiff,
     "jit": jit,
     "large": large,
+    "gpu": gpu,
 }
+# By themselves these take what JAX finds.
+ON_CPU = [part for part in PARTS if part != "gpu"]
 QUICK = ("dae_jax_peer", "c_limit", "plain_diffrax")
 
 
 def main(argv=None):
     """Print the tables, write data and figures, and set the measurements against what they must reach."""
     parser = argparse.ArgumentParser(prog="dae-jax bench", description=__doc__)
-    parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=PARTS, metavar="PART", help=", ".join(PARTS))
+    parser.add_argument("--parts", nargs="+", default=ON_CPU, choices=PARTS, metavar="PART", help=", ".join(PARTS))
     parser.add_argument("--peers", nargs="+", choices=NAMES, metavar="PEER", help=f"by default all: {', '.join(NAMES)}")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--quick", action="store_true", help="a smoke test: few points; this library, C and diffrax")
@@ -40,7 +43,8 @@ def main(argv=None):
     if arguments.quick and arguments.peers:
         parser.error(f"--quick takes no --peers: it is for {', '.join(QUICK)}")
     writable(parser, arguments.out)
-    os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    if "gpu" not in arguments.parts:
+        os.environ.setdefault("JAX_PLATFORMS", "cpu")
     if arguments.synchronous:
         import jax
 

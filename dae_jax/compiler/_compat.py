@@ -11,7 +11,7 @@ import numpy as np
 from jax._src import xla_bridge
 from jax.interpreters.partial_eval import dce_jaxpr as dce_jaxpr
 
-from .types import Aval, Equation
+from .types import Aval, Equation, Params
 
 
 def setting(name: str) -> bool:
@@ -30,6 +30,14 @@ def compilation_cache_folder() -> str | None:
     if not folder or "://" in folder or not jax.config.values["jax_enable_compilation_cache"]:
         return None
     return folder
+
+
+def scan_counts(params: Params) -> tuple[int, int]:
+    """How many operands of a `scan` are the same at each turn, and how many it carries; from JAX 0.11 on two trees say so."""
+    if "ft_in" in params:
+        consts, carry, _ = map(len, params["ft_in"].unpack())
+        return consts, carry
+    return params["num_consts"], params["num_carry"]
 
 
 def is_check(eqn: Equation) -> bool:

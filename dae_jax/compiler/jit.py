@@ -83,7 +83,7 @@ class Jitted:
         return self if instance is None else functools.partial(self, instance)
 
     def _traced(self, *args: PyTree, **kwargs: PyTree) -> Any:
-        if not one_kernel_enabled() or jax.default_backend() != "cpu":
+        if not one_kernel_enabled():
             return self._fn(*args, **kwargs)
         flat, arrays, tree = _of_arrays(self._fn, args, kwargs)
         jaxpr = jax.make_jaxpr(flat)(*arrays)
@@ -106,7 +106,7 @@ def _compiles(jitted: Jitted, leaves: tuple[jax.ShapeDtypeStruct, ...], tree: An
 
 def compiles(jitted: Jitted, *args: PyTree) -> bool:
     """Whether our compiler makes one kernel of a call with arguments of these shapes (`jax.ShapeDtypeStruct`s), here and now."""
-    if not one_kernel_enabled() or jax.default_backend() != "cpu":
+    if not one_kernel_enabled():
         return False
     leaves, tree = jax.tree.flatten(args)
     return _compiles(jitted, tuple(leaves), tree, current())

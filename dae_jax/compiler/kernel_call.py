@@ -5,6 +5,7 @@ our own compiler where it can, else XLA's single kernels, else XLA as it is. A b
 """
 
 import dataclasses
+import functools
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
@@ -21,9 +22,11 @@ from jaxtyping import Array, PyTree
 from . import fallbacks, lower, waiting, xla_kernel
 from ._compat import dce_jaxpr, setting
 from .check import checked
+from .emit.target import Target
 from .jaxprs.expansions import expanded, kernel_written_out
 from .jaxprs.scalar_interpreter import Unsupported
 from .jaxprs.unchecked import checks_dropped
+from .on_gpu import gpu
 from .settings import current
 
 
@@ -57,11 +60,11 @@ def hindrances(jaxpr: ClosedJaxpr) -> tuple[str, ...]:
     return tuple(dict.fromkeys(x.primitive for x in found.unsupported)) if found.compiler == "xla" else ()
 
 
-def _decided(kernel: ClosedJaxpr, lanes: tuple[bool, ...]) -> Decision:
+def _decided(kernel: ClosedJaxpr, lanes: tuple[bool, ...], target: Target | None = None) -> Decision:
     if current().compiler != "llvm":
         found = (Unsupported(f"our compiler is switched off: `compiler={current().compiler!r}`"),)
     else:
-        found = lower.unsupported(kernel, lanes)
+        found = lower.unsupported(kernel, lanes, target)
     if not found:
         return Decision("llvm", ())
     # Which form of a batch XLA takes depends on its size.
@@ -141,19 +144,19 @@ def _(*args: Array, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> Any:
     return [v.aval.update(shape=(*lead, *v.aval.shape)) for v in jaxpr.jaxpr.outvars]
 
 
-def _lower(*args: Array, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> list[Any]:
+def _lower(*args: Array, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], on_gpu: bool) -> list[Any]:
     began = waiting.begin()
     try:
-        return _lowered(args, jaxpr, lanes)
+        return _lowered(args, jaxpr, lanes, on_gpu)
     finally:
         if began:
             waiting.end()
 
 
-def _lowered(args: Sequence[Array], jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> list[Any]:
-    ours = _by_llvm(jaxpr, lanes, args)
+def _lowered(args: Sequence[Array], jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], on_gpu: bool) -> list[Any]:
+    ours = _by_llvm(jaxpr, lanes, args, on_gpu)
     if ours is None:
-        return _by_xla(jaxpr, lanes, args)
+        return kernel_written_out(*args, jaxpr=jaxpr, lanes=lanes) if on_gpu else _by_xla(jaxpr, lanes, args)
     if current().check:
         return checked(
             ours, jax.jit(lambda *xs: kernel_written_out(*xs, jaxpr=jaxpr, lanes=lanes))(*args), current().check
@@ -161,11 +164,12 @@ def _lowered(args: Sequence[Array], jaxpr: ClosedJaxpr, lanes: tuple[bool, ...])
     return ours
 
 
-def _by_llvm(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Sequence[Array]) -> list[Any] | None:
-    if _decided(jaxpr, lanes).compiler != "llvm":
+def _by_llvm(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Sequence[Array], on_gpu: bool) -> list[Any] | None:
+    target = gpu() if on_gpu else None
+    if (on_gpu and target is None) or _decided(jaxpr, lanes, target).compiler != "llvm":
         return None
     try:
-        return lower.compiled(jaxpr, lanes)(*args)
+        return lower.compiled(jaxpr, lanes, target=target)(*args)
     except Unsupported as reason:
         fallbacks.note(str(reason))
     except Exception as error:  # XLA can still do it
@@ -193,7 +197,9 @@ def _in_turn(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Sequence[Array])
     return jax.lax.map(one_lane, tuple(x for x, b in zip(args, lanes, strict=True) if b))
 
 
-mlir.register_lowering(kernel_p, mlir.lower_fun(_lower, multiple_results=True), platform="cpu")
+for _platform in ("cpu", "cuda"):
+    _here = functools.partial(_lower, on_gpu=_platform == "cuda")
+    mlir.register_lowering(kernel_p, mlir.lower_fun(_here, multiple_results=True), platform=_platform)
 mlir.register_lowering(kernel_p, mlir.lower_fun(kernel_written_out, multiple_results=True))
 
 

@@ -38,7 +38,7 @@ def one_kernel(
       a way is known that has forward derivatives.
     - `forward`, with "reverse": the same function, with forward derivatives of any order, where `fn` has none.
     """
-    if not one_kernel_enabled() or jax.default_backend() != "cpu" or derivative == "any":
+    if not one_kernel_enabled() or derivative == "any":
         return fn
     return _forward(fn) if derivative == "forward" else _reverse(fn, pull_back, forward or fn)
 

@@ -42,8 +42,9 @@ def current() -> Settings:
 
 
 def one_kernel_enabled() -> bool:
-    """Whether solves that are traced now may become one kernel; what JAX is told not to compile does not."""
-    return current().compiler != "off" and not setting("jax_disable_jit")
+    """Whether solves that are traced now may become one kernel, on the CPU or a GPU; what JAX is told not to compile does not."""
+    here = jax.default_backend() in ("cpu", "gpu")
+    return here and current().compiler != "off" and not setting("jax_disable_jit")
 
 
 def processors() -> int:

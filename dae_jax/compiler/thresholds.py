@@ -16,6 +16,8 @@ class Thresholds:
     - `per_turn`: entries that the body of a loop over an array has written out at most. More gain nothing, and take longer to compile.
     - `stack_bytes`: bytes of a buffer that the stack holds; larger ones are taken from the heap, all at once.
     - `heap_bytes`: bytes of memory that a function may take for its arrays, all lanes of a vector together.
+    - `thread_bytes`: bytes of a buffer that a thread on a GPU has of its own, since the device keeps as much for each that may run;
+      larger ones are in a buffer of XLA's that all threads share, number beside number.
     - `fused_depth`: operations in one loop; more would nest our own calls too deep.
     - `long_loop`: turns from which on loops use the machine's longest vectors: a chain of 64 pendulums gains 15 %, arrays of ten
       lose 25 %.
@@ -48,6 +50,7 @@ class Thresholds:
     per_turn: int = 4
     stack_bytes: int = 1024
     heap_bytes: int = 2**30
+    thread_bytes: int = 2**12
     fused_depth: int = 40
     long_loop: int = 256
     written_out: int = 200

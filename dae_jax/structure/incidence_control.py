@@ -6,6 +6,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 from scipy.sparse import csr_array
 
+from ..compiler import scan_counts
 from ..compiler.types import Equation
 from .blocks import block_triangular
 from .cells import Cells
@@ -37,7 +38,7 @@ def cond(eqn: Equation, inputs: list[Cells], run: Run, sets: Sets) -> list[Cells
 def scan(eqn: Equation, inputs: list[Cells], run: Run, sets: Sets) -> list[Cells]:
     """Step by step; a loop of more than `LONGEST_LOOP` steps as one step repeated any number of times."""
     p = eqn.params
-    n_consts, n_carry, length = p["num_consts"], p["num_carry"], p["length"]
+    (n_consts, n_carry), length = scan_counts(p), p["length"]
     consts, carry, xs = inputs[:n_consts], inputs[n_consts : n_consts + n_carry], inputs[n_consts + n_carry :]
     if length > LONGEST_LOOP:
         return _long_scan(eqn, consts, carry, xs, run, sets)

@@ -178,7 +178,7 @@ class TestLowered:
             assert ("@dae_jax_" in text) == (jit(fn).lower(X).compiler == "llvm")
 
     def test_what_is_too_large_for_lanes_only(self):
-        fn = jit(lambda x: jnp.sum(jnp.cumsum(jnp.sin(x + jnp.arange(2.0**24)))))
+        fn = jit(lambda x: jnp.sum(jnp.cumsum(jnp.sin(x + jnp.arange(2.0**26)))))
         alone = fn.lower(1.0)
         assert (alone.compiler, alone.batch().compiler == "llvm") == ("llvm", False)
         assert [reason.primitive for reason in alone.batch().unsupported] == ["size"]

@@ -80,7 +80,7 @@ class TestTargets:
         except RuntimeError:
             pytest.skip(f"LLVM was built without {triple}")
         from dae_jax.compiler.emit import vector_math
-        from dae_jax.compiler.lower import annotated, estimate, instructions, module
+        from dae_jax.compiler.lower import instructions, module
         from dae_jax.compiler.lower.rules import floats
 
         asked = set()
@@ -92,8 +92,7 @@ class TestTargets:
             return True
 
         monkeypatch.setattr(vector_math, "host", lambda: other)
-        for user in (annotated, estimate, instructions):
-            monkeypatch.setattr(user, "vector_size", lambda: other.width)
+        monkeypatch.setattr(instructions, "vector_size", lambda: other.width)
         monkeypatch.setattr(floats, "has_symbol", looked_up)
         monkeypatch.setattr(runtime, "has_symbol", looked_up)
         table = lambda x: (jnp.arange(400.0) * x[0]).at[3].set(jnp.cbrt(x[1]))

@@ -53,8 +53,8 @@ def test_very_many_steps(monkeypatch):
     control = {"stepsize_controller": diffrax.PIDController(rtol=1e-4, atol=1e-4)}
     with pytest.warns(AccuracyWarning, match="million steps"):
         assert of(solved(spring(3.0), TSIT5, 100.0, None, **control)) == 4
-    monkeypatch.undo()
-    assert of(solved(spring(3.0), TSIT5, 101.0, None, **control)) == 0
+    few = solved(spring(3.0), TSIT5, 5.0, None, **control)
+    assert (of(few), int(few.stats["num_accepted_steps"]) < 100) == (0, True)
 
 
 def test_in_a_batch_and_under_jit_it_is_a_number():

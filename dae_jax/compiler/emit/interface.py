@@ -13,14 +13,17 @@ OFFSETS = {
     "XLA_FFI_CallFrame": {
         "struct_size": 0, "extension_start": 8, "api": 16, "ctx": 24, "stage": 32, "args": 40, "rets": 80, "attrs": 120, "": 168,
     },
-    "XLA_FFI_Args": {"args": 32, "": 40},
-    "XLA_FFI_Rets": {"rets": 32, "": 40},
+    "XLA_FFI_Args": {"size": 16, "args": 32, "": 40},
+    "XLA_FFI_Rets": {"size": 16, "rets": 32, "": 40},
     "XLA_FFI_Buffer": {"data": 24, "dims": 40, "": 48},
     "XLA_FFI_Extension_Base": {"struct_size": 0, "type": 8, "": 24},
     "XLA_FFI_Metadata_Extension": {"extension_base": 0, "metadata": 24, "": 32},
     "XLA_FFI_Metadata": {"struct_size": 0, "api_version": 8, "traits": 32, "": 36},
     "XLA_FFI_Api_Version": {"struct_size": 0, "extension_start": 8, "major_version": 16, "minor_version": 20, "": 24},
-    "XLA_FFI_Api": {"XLA_FFI_Error_Create": 48, "XLA_FFI_Error_Destroy": 64, "XLA_FFI_ThreadPool_Schedule": 136},
+    "XLA_FFI_Api": {
+        "XLA_FFI_Error_Create": 48, "XLA_FFI_Error_Destroy": 64, "XLA_FFI_Stream_Get": 80, "XLA_FFI_ThreadPool_Schedule": 136,
+    },
+    "XLA_FFI_Stream_Get_Args": {"struct_size": 0, "extension_start": 8, "ctx": 16, "stream": 24, "": 32},
     "XLA_FFI_Error_Create_Args": {"struct_size": 0, "extension_start": 8, "message": 16, "errc": 24, "": 28},
     "XLA_FFI_Error_Destroy_Args": {"struct_size": 0, "extension_start": 8, "error": 16, "": 24},
     "XLA_FFI_ThreadPool_Schedule_Args": {

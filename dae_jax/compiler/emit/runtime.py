@@ -19,6 +19,8 @@ from .vector_math import has_symbol
 # Fewer vectors than these are not worth the 5 µs until another thread has begun.
 VECTORS = 4
 SLOT_BYTES = 64
+# How many threads of a GPU are stood in for here.
+THREADS_IN_TURN = 3
 # How many handlers are made at a time.
 STUBS = 32
 # The symbols that functions of all modules can name.
@@ -75,6 +77,27 @@ def in_threads(body: list[str], find_batch: list[str], width: int) -> list[str]:
         f"%status = call i32 @{SHARE}(ptr %frame, ptr @{{name}}.work, ptr %args, ptr %results, i64 %vectors)",
         "ret i32 %status",
         "}",
+    ]
+
+
+def in_turn(body: list[str], room: int) -> list[str]:
+    """The same for a batch as a GPU's threads do it, `THREADS_IN_TURN` of them and one after another.
+
+    `body` finds %batch, begins with element %first and goes on in steps of %threads; of the buffer %room each thread has so many
+    bytes.
+    """
+    calls = [f"call void @{{name}}.thread(ptr %args, ptr %results, i64 {k}, ptr %room)" for k in range(THREADS_IN_TURN)]
+    return [
+        "define internal void @{name}.thread(ptr %args, ptr %results, i64 %first, ptr %room) {",
+        "entry:",
+        f"%threads = add i64 {THREADS_IN_TURN}, 0",
+        *body,
+        "ret void",
+        "}",
+        *alone(
+            [f"%room = call ptr @malloc(i64 {room * THREADS_IN_TURN + 64})", *calls, "call void @free(ptr %room)"],
+            False,
+        ),
     ]
 
 

@@ -18,12 +18,22 @@ _VECTOR_ABI = {("x86_64", 2): "b", ("x86_64", 4): "d", ("x86_64", 8): "e", ("aar
 
 @dataclasses.dataclass(frozen=True)
 class Target:
-    """A machine: LLVM's names for it, and how many numbers of 64 bits its vectors hold."""
+    """A machine: LLVM's names for it, and how many numbers of 64 bits its vectors hold.
+
+    - `threads`: an element of a batch is a thread of its own, not a lane of a vector; `width` is 1 then.
+    - `library`: what the names of its C library's functions begin with.
+    """
 
     triple: str
     cpu: str
     features: str
     width: int
+    threads: bool = False
+    library: str = ""
+
+    @property
+    def is_gpu(self) -> bool:
+        return self.triple.startswith("nvptx")
 
     @property
     def vector_abi(self) -> str | None:

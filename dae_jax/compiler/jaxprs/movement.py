@@ -60,8 +60,8 @@ def split(eqn: Equation, x: Entries) -> list[Entries]:
 
 def unstack(eqn: Equation, x: Entries) -> list[Entries]:
     """The entries along an axis."""
-    pieces = np.split(x, len(eqn.outvars), eqn.params["axis"])
-    return [piece.reshape(v.aval.shape) for piece, v in zip(pieces, eqn.outvars, strict=True)]
+    entries = np.moveaxis(x, eqn.params["axis"], 0)
+    return [entries[k, ...] for k in range(len(entries))]
 
 
 def stack(eqn: Equation, *xs: Entries) -> Entries:

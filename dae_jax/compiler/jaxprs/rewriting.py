@@ -8,6 +8,7 @@ from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from jaxtyping import Array
 
+from .._compat import scan_counts
 from ..types import Arrays, Equation, Params
 from .scalar_interpreter import Unsupported
 from .walk import CALLS, WITH_DERIVATIVE, called, equations, equations_in, identity, of_solve
@@ -109,7 +110,7 @@ class Rewriting:
         return eqn.primitive.bind(*args, *state, **params)
 
     def _scan(self, p: Params, args: Arrays, state: Arrays) -> tuple[list[Any], list[Any]]:
-        n, k, body = p["num_consts"], p["num_carry"], p["jaxpr"]
+        (n, k), body = scan_counts(p), p["jaxpr"]
 
         def turn(carry: tuple[Arrays, Arrays], xs: Sequence[Array]) -> Any:
             found, now = self.run(body.jaxpr, body.consts, [*args[:n], *carry[0], *xs], carry[1])

@@ -29,6 +29,7 @@ def address_of(code: Instructions, buffer: Buffer, place: Index) -> str:
     """The address of a number that is in one place for all lanes."""
     if isinstance(place, int) and place == 0:
         return buffer.pointer
+    assert not buffer.apart
     place = code.times(place, 2) if buffer.parts == 2 and not buffer.plane else place
     address, each = _address(code, buffer, place)
     assert not each
@@ -47,6 +48,8 @@ def _stored(buffer: Buffer) -> str:
 def _address(code: Instructions, buffer: Buffer, place: Index) -> tuple[str, bool]:
     """The address of a number, or a vector of addresses (and whether it is one)."""
     each = isinstance(place, Value) and place.lanes
+    if buffer.apart:
+        place = code.times(place, Value("%threads", "i64"))
     if buffer.lanes:
         place = code.times(place, code.width)
         if each and isinstance(place, Value):

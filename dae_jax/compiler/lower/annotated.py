@@ -5,7 +5,7 @@ from typing import Any
 
 from jax.extend.core import ClosedJaxpr
 
-from ..emit.target import vector_size
+from ..emit.target import Target
 from .inlining import Inlining
 from .registry import quoted
 
@@ -40,6 +40,7 @@ class Annotated:
     - `inlined`: the jaxprs of its loops and branches without calls.
     - `cost`, `bytes`: about how many instructions it takes, and at most how many bytes its arrays, of one element.
     - `notes`: what will become of each equation.
+    - `target`: the machine that it is compiled for.
     - `text`: the module, where it has been written already.
     """
 
@@ -48,6 +49,7 @@ class Annotated:
     inlined: Inlining
     notes: tuple[Note, ...]
     bytes: int
+    target: Target
     text: str | None = None
 
     @property
@@ -57,7 +59,7 @@ class Annotated:
     @property
     def width(self) -> int:
         """How many lanes a vector has."""
-        return vector_size() if any(self.batched) else 1
+        return self.target.width if any(self.batched) else 1
 
     def __str__(self) -> str:
         head = f"{self.cost} instructions, {self.bytes} bytes, {self.width} lanes"

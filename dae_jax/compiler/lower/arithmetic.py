@@ -13,7 +13,7 @@ from .dtypes import BYTES, is_signed, kind_of, part
 from .instructions import Complex, Instructions, Number, Value, parts
 
 
-_OF_FLOATS = {"add": "fadd contract", "sub": "fsub contract", "mul": "fmul contract", "div": "fdiv", "rem": "frem"}
+_OF_FLOATS = {"add": "fadd contract", "sub": "fsub contract", "mul": "fmul contract", "div": "fdiv"}
 _OF_TRUTH_VALUES = {"add": "or", "mul": "and", "max": "or", "min": "and"}
 _COMPARISONS = {"eq": "oeq", "ne": "une", "lt": "olt", "le": "ole", "gt": "ogt", "ge": "oge"}
 _KNOWN = {
@@ -32,10 +32,12 @@ def applied(code: Instructions, name: str, dtype: np.dtype, a: Number, b: Number
     if kind == "i1":
         name = _OF_TRUTH_VALUES.get(name, name)
     if name in ("max", "min"):
-        prefix = "" if dtype.kind == "f" else "s" if is_signed(dtype) else "u"
-        return code.intrinsic({"": name + "imum"}.get(prefix, prefix + name), kind, a, b)
+        if dtype.kind == "f":
+            return code.extremum(name + "imum", kind, a, b)
+        return code.intrinsic(("s" if is_signed(dtype) else "u") + name, kind, a, b)
     if dtype.kind == "f":
-        return _of_floats(code, name, kind, a, b)
+        # Not by an instruction, since there are machines on which that rounds the quotient.
+        return code.library("fmod", kind, a, b) if name == "rem" else _of_floats(code, name, kind, a, b)
     if name in ("div", "rem"):
         return _quotient(code, name, dtype, a, b)
     return code.op(name, kind, a, b)
@@ -66,7 +68,7 @@ def _of_floats(code: Instructions, name: str, kind: str, a: Number, b: Number) -
 
 def _log_of_sum(code: Instructions, kind: str, a: Number, b: Number) -> Value:
     """log(eᵃ + eᵇ)."""
-    largest = code.intrinsic("maximum", kind, a, b)
+    largest = code.extremum("maximum", kind, a, b)
     apart = code.intrinsic("fabs", kind, code.op("fsub", kind, a, b))
     more = code.library("log1p", kind, code.library("exp", kind, code.op("fneg", kind, apart)))
     # Of two infinities of one sign the difference is none.

@@ -28,7 +28,8 @@ import numpy as np
 class Buffer:
     """Memory for numbers of one type. `references` counts who reads it later, `held` says that it is needed though nothing
     may refer to it; `bytes` is 0 for memory that is not ours. A complex number has two `parts`: all
-    imaginary ones come `plane` numbers after the real ones, or each after its real one where that is 0.
+    imaginary ones come `plane` numbers after the real ones, or each after its real one where that is 0. Where `apart` is not 0,
+    the numbers of one thread lie %threads numbers apart, and have so many bytes each.
     """
 
     pointer: str
@@ -40,6 +41,7 @@ class Buffer:
     bytes: int = 0
     references: int = 0
     held: bool = False
+    apart: int = 0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -7,7 +7,8 @@ from typing import Any
 
 from jax.extend.core import ClosedJaxpr, Literal, Var
 
-from ..emit.target import vector_size
+from .._compat import scan_counts
+from ..emit.target import Target
 from ..jaxprs.numbers import is_on_numbers
 from ..jaxprs.walk import equations
 from ..thresholds import THRESHOLDS
@@ -31,12 +32,12 @@ class _State:
     varying: bool
 
 
-def annotated(jaxpr: ClosedJaxpr, batched: tuple[bool, ...], inlined: Inlining) -> Annotated:
+def annotated(jaxpr: ClosedJaxpr, batched: tuple[bool, ...], inlined: Inlining, target: Target) -> Annotated:
     """A function without calls, with what will become of each equation."""
     lanes = list(batched) or [False] * len(jaxpr.jaxpr.invars)
-    found = _Estimate(inlined, vector_size() if any(batched) else 1)
+    found = _Estimate(inlined, target.width if any(batched) else 1)
     found.run(jaxpr, [found.loaded(v.aval, each) for v, each in zip(jaxpr.jaxpr.invars, lanes, strict=True)], 0, 1)
-    return Annotated(jaxpr, batched, inlined, tuple(found.notes), found.bytes)
+    return Annotated(jaxpr, batched, inlined, tuple(found.notes), found.bytes, target)
 
 
 class _Estimate:
@@ -107,7 +108,7 @@ class _Estimate:
                 self._procedures[form] = self.run(self.inlined(p["jaxpr"]), args, depth, 1)
             outs = self._procedures[form]
         elif eqn.primitive.name == "scan":
-            n, m, body = p["num_consts"], p["num_carry"], p["jaxpr"]
+            (n, m), body = scan_counts(p), p["jaxpr"]
             turns = p["length"] if is_written_out(eqn) else 1
             rows = [self.loaded(v.aval, True) for v in body.jaxpr.invars[n + m :]]
             self.run(self.inlined(body), [*args[:n], *outs[:m], *rows], depth, turns * times)
@@ -119,7 +120,7 @@ class _Estimate:
 
 def is_written_out(eqn: Equation) -> bool:
     """Whether the turns of a `scan` stand one after another."""
-    p, of_ys = eqn.params, [v.aval for v in eqn.outvars[eqn.params["num_carry"] :]]
+    p, of_ys = eqn.params, [v.aval for v in eqn.outvars[scan_counts(eqn.params)[1] :]]
     total = p["length"] * (1 + sum(1 for _ in equations(p["jaxpr"])))
     few = total <= THRESHOLDS.written_out and all(y.size <= THRESHOLDS.in_registers for y in of_ys)
     return few or p["length"] <= 1

@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..emit.target import vector_size
+from ..emit.target import Target, vector_size
 from ..emit.vector_math import vector_function
 
 
@@ -41,8 +41,9 @@ Index: TypeAlias = Value | int
 class Instructions:
     """A function's instructions, written one after another; `mask` says which lanes take part, all where it is `None`."""
 
-    def __init__(self, width: int = 1, prefix: str = "") -> None:
-        self.width = width
+    def __init__(self, width: int = 1, prefix: str = "", target: Target | None = None) -> None:
+        self.width, self.target = width, target
+        self._of_library = target.library if target else ""
         self._prefix = f"{prefix}v"
         self.mask: Value | None = None
         self.lines: list[str] = []
@@ -194,10 +195,18 @@ class Instructions:
             f"call {vector} {function}({', '.join(self.operand(x, kind, lanes) for x in xs)})", kind, lanes
         )
 
+    def extremum(self, name: str, kind: str, a: Number, b: Number) -> Value:
+        """`maximum` or `minimum` of two floats: NaN where one is, and 0 above −0."""
+        if kind == "float" or self.target is None or not self.target.is_gpu:
+            return self.intrinsic(name, kind, a, b)
+        # Of doubles a GPU has these but for NaN only; LLVM makes ten instructions of what these three are.
+        found = self.intrinsic(name.replace("imum", "num"), kind, a, b)
+        return self.select(self.op("fcmp uno", kind, a, b, result="i1"), np.nan, found, kind)
+
     def library(self, name: str, kind: str, *xs: Number) -> Value:
         """A function of the C library, lane by lane where it has none for vectors."""
         name = name if kind == "double" else f"{name}f"
-        function = self.function(name, kind, *[kind] * len(xs))
+        function = self.function(f"{self._of_library}{name}", kind, *[kind] * len(xs))
         call = lambda ys: self.pure(
             f"call {kind} {function}({', '.join(self.operand(y, kind) for y in ys)})", kind, False
         )

@@ -23,16 +23,22 @@ from .registry import RULES, named, quoted
 from .repeated import repeated
 
 
-def annotate(jaxpr: ClosedJaxpr, batched: tuple[bool, ...] = ()) -> Annotated | Unsupported:
-    """The function as it will be compiled, or why it cannot be; `batched`: which arguments have a leading axis of lanes."""
-    if not available():
+def annotate(
+    jaxpr: ClosedJaxpr, batched: tuple[bool, ...] = (), target: Target | None = None
+) -> Annotated | Unsupported:
+    """The function as it will be compiled, or why it cannot be; `batched`: which arguments have a leading axis of lanes;
+    `target`: the machine, this one if it is not given.
+    """
+    if target is None and not available():
         return Unsupported("no machine code is made for this operating system", primitive="system")
-    return _annotated(jaxpr, batched, host())
+    return _annotated(jaxpr, batched, target or host())
 
 
-def unsupported(jaxpr: ClosedJaxpr, batched: tuple[bool, ...] = ()) -> tuple[Unsupported, ...]:
+def unsupported(
+    jaxpr: ClosedJaxpr, batched: tuple[bool, ...] = (), target: Target | None = None
+) -> tuple[Unsupported, ...]:
     """All that keeps a function from being compiled; empty if nothing does."""
-    judged, inlined = annotate(jaxpr, batched), Inlining()
+    judged, inlined = annotate(jaxpr, batched, target), Inlining()
     if isinstance(judged, Annotated):
         return ()
     if judged.primitive == "size":
@@ -41,16 +47,16 @@ def unsupported(jaxpr: ClosedJaxpr, batched: tuple[bool, ...] = ()) -> tuple[Uns
 
 
 @functools.lru_cache(maxsize=4)
-def _annotated(jaxpr: ClosedJaxpr, batched: tuple[bool, ...], _: Target) -> Annotated | Unsupported:
+def _annotated(jaxpr: ClosedJaxpr, batched: tuple[bool, ...], target: Target) -> Annotated | Unsupported:
     whole, inlined = without_keys(jaxpr), Inlining()
     found = next(_unsupported(inlined(whole), inlined), None)
     if found is not None:
         return found
-    annotated = estimate.annotated(inlined(whole), batched, inlined)
-    if annotated.cost > THRESHOLDS.whole:
+    annotated = estimate.annotated(inlined(whole), batched, inlined, target)
+    if annotated.cost > THRESHOLDS.whole and not target.threads:
         # Not where the whole is small enough: a function is faster by a fifth as a part of its surroundings.
         inlined = Inlining(repeated(whole))
-        annotated = estimate.annotated(inlined(whole), batched, inlined)
+        annotated = estimate.annotated(inlined(whole), batched, inlined, target)
     return _unless_too_large(annotated)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 from jax.typing import ArrayLike
 
+from ..emit.target import Target
 from ..jaxprs.numbers import on_numbers
 from ..jaxprs.objects import is_number, objects
 from ..thresholds import THRESHOLDS
@@ -36,8 +37,16 @@ class Lowering:
     An entry that is known is a numpy scalar. `limit`: after how many instructions it is given up with `TooLarge`.
     """
 
-    def __init__(self, width: int, always_copies: bool, limit: float, inlined: Inlining, prefix: str = "") -> None:
-        self.code = Instructions(width, prefix)
+    def __init__(
+        self,
+        width: int,
+        always_copies: bool,
+        limit: float,
+        inlined: Inlining,
+        prefix: str = "",
+        target: Target | None = None,
+    ) -> None:
+        self.code = Instructions(width, prefix, target)
         self.memory = Memory(self.code, always_copies)
         self.procedures = Procedures()
         self.inlined = inlined

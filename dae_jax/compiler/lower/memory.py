@@ -19,7 +19,11 @@ from .instructions import Index, Instructions, Number
 
 
 class Memory:
-    """A function's arrays; `heap` is how many bytes of them are not on the stack; `stack` and `on_heap` find them."""
+    """A function's arrays; `heap` is how many bytes of them are not on the stack; `stack` and `on_heap` find them.
+
+    With a thread for each element, `room` is how many bytes of the largest each has in a buffer that they share; `in_room`
+    finds these.
+    """
 
     def __init__(self, code: Instructions, always_copies: bool = False) -> None:
         self.code = code
@@ -29,7 +33,9 @@ class Memory:
         self.stack: list[str] = []
         self.on_heap: list[str] = []
         self.heap = 0
-        self.free: dict[int, list[str]] = {}
+        self.in_room: list[str] = []
+        self.room = 0
+        self.free: dict[tuple[int, int], list[str]] = {}
         self.recycles = not always_copies
         self.constants: list[str] = []
 
@@ -43,22 +49,33 @@ class Memory:
     def _buffer(self, dtype: np.dtype, size: int) -> Buffer:
         kind, parts = parts_of(dtype)
         plane, size = size, size * parts * BYTES[kind] * self.code.width
-        free = self.free.get(size)
-        if free:
-            return Buffer(free.pop(), kind, self.code.width > 1, parts=parts, plane=plane, bytes=size)
+        threads = self.code.target is not None and self.code.target.threads
+        apart = BYTES[kind] if threads and size > THRESHOLDS.thread_bytes else 0
+        free = self.free.get((size, apart))
+        pointer = free.pop() if free else self._new(size, kind, apart)
+        return Buffer(pointer, kind, self.code.width > 1, parts=parts, plane=plane, bytes=size, apart=apart)
+
+    def _new(self, size: int, kind: str, apart: int) -> str:
         pointer = f"%{self.code.name()}"
-        if size <= THRESHOLDS.stack_bytes:
+        if apart:
+            self.in_room += [
+                f"{pointer}.at = mul i64 %threads, {self.room}",
+                f"{pointer}.all = getelementptr i8, ptr %room, i64 {pointer}.at",
+                f"{pointer} = getelementptr {'i8' if kind == 'i1' else kind}, ptr {pointer}.all, i64 %first",
+            ]
+            self.room += -(-size // 64) * 64
+        elif size <= THRESHOLDS.stack_bytes:
             self.stack.append(f"{pointer} = alloca [{size} x i8], align 64")
         else:
             self.on_heap.append(f"{pointer} = getelementptr i8, ptr %heap, i64 {self.heap}")
             self.heap += -(-size // 64) * 64 + 192
-        return Buffer(pointer, kind, self.code.width > 1, parts=parts, plane=plane, bytes=size)
+        return pointer
 
     def recycle(self, buffers: Iterable[Buffer]) -> None:
         """Memory that nothing needs any more is used again, while it is in the cache."""
         for buffer in buffers:
             if buffer.bytes and not buffer.references and not buffer.held and self.recycles:
-                self.free.setdefault(buffer.bytes, []).append(buffer.pointer)
+                self.free.setdefault((buffer.bytes, buffer.apart), []).append(buffer.pointer)
                 buffer.bytes = 0
 
     def new(self, dtype: DType, shape: Sequence[int]) -> View:

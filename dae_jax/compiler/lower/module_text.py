@@ -1,12 +1,15 @@
-"""A jaxpr as one function in the machine's code: for one element, or for a batch whose elements are lanes of vectors."""
+"""A jaxpr as one function in the machine's code: for one element, for a batch whose elements are lanes of vectors, or for one
+with a thread for each element.
+"""
 
 import contextlib
 from typing import Any
 
 import numpy as np
 
+from ..emit import ptx
 from ..emit.interface import batch_size, buffer
-from ..emit.runtime import alone, heap, in_threads
+from ..emit.runtime import alone, heap, in_threads, in_turn
 from ..thresholds import THRESHOLDS
 from ..types import Aval
 from .access import store
@@ -27,7 +30,7 @@ def module_text(annotated: Annotated, always_copies: bool = False, limit: float 
     Errors: `TooLarge` for more than `limit` instructions, or arrays that take too much memory; none without a limit.
     """
     place = main_loop(annotated.jaxpr) if any(annotated.batched) else None
-    if place is not None:
+    if place is not None and not annotated.target.threads:
         with contextlib.suppress(NotQueued):
             return _Module(annotated, always_copies, limit).text(place)
     return _Module(annotated, always_copies, limit).text(None)
@@ -35,9 +38,9 @@ def module_text(annotated: Annotated, always_copies: bool = False, limit: float 
 
 class _Module:
     def __init__(self, annotated: Annotated, always_copies: bool, limit: float) -> None:
-        self.jaxpr, self.limit = annotated.jaxpr, limit
+        self.jaxpr, self.limit, self.target = annotated.jaxpr, limit, annotated.target
         self.batched = list(annotated.batched) or [False] * len(self.jaxpr.jaxpr.invars)
-        self.lowering = Lowering(annotated.width, always_copies, limit, annotated.inlined)
+        self.lowering = Lowering(annotated.width, always_copies, limit, annotated.inlined, target=self.target)
         self.code, self.memory = self.lowering.code, self.lowering.memory
 
     def text(self, place: int | None) -> str:
@@ -45,7 +48,9 @@ class _Module:
         code, memory, lanes = self.code, self.memory, any(self.batched)
         ins, outs = self.jaxpr.jaxpr.invars, self.jaxpr.jaxpr.outvars
         code.block = "start"
-        if lanes:
+        if lanes and self.target.threads:
+            self._elements()
+        elif lanes:
             self._batch(place)
         else:
             self._store(self.lowering.run(self.jaxpr, self._arguments(None)), None, None)
@@ -53,12 +58,17 @@ class _Module:
         found += [line for k in range(len(outs)) for line in buffer("%results", k, f"result{k}")]
         taken, given_back = self._heap()
         # What is on the stack belongs into the first block: elsewhere LLVM keeps none of it in registers.
-        body = [*found, *memory.stack, *taken, "br label %start", "start:", *code.lines, *given_back]
-        functions = (
-            in_threads(body, self._find_batch(), code.width)
-            if lanes
-            else alone(body, code.longest >= THRESHOLDS.long_loop)
-        )
+        body = [*memory.stack, *taken, *memory.in_room, "br label %start", "start:", *code.lines, *given_back]
+        if self.target.is_gpu:
+            functions = ptx.kernel(body, len(ins), len(outs), memory.room)
+        elif lanes and self.target.threads:
+            code.function("malloc", "ptr", "i64")
+            code.function("free", "void", "ptr")
+            functions = in_turn([*found, *batch_size(f"arg{self.batched.index(True)}"), *body], memory.room)
+        elif lanes:
+            functions = in_threads([*found, *body], self._find_batch(), code.width)
+        else:
+            functions = alone([*found, *body], code.longest >= THRESHOLDS.long_loop)
         return "\n".join([*memory.constants, *code.declared.values(), *self.lowering.procedures.lines, *functions])
 
     def _find_batch(self) -> list[str]:
@@ -73,6 +83,8 @@ class _Module:
             raise TooLarge
         if not size:
             return [], []
+        if self.target.threads:
+            return [f"%heap = alloca [{size} x i8], align 64", *self.memory.on_heap], []
         code.function("malloc", "ptr", "i64")
         code.function("free", "void", "ptr")
         taken, given_back = heap(size)
@@ -107,6 +119,23 @@ class _Module:
         buffer = Buffer(pointer, kind, False, writable, parts)
         place = 0 if row is None else self.code.times(row, aval.size)
         return View(np.dtype(aval.dtype), aval.shape, buffer, row_major(aval.shape), place)
+
+    def _elements(self) -> None:
+        """The elements of one thread: from its first one on in steps of the number of threads."""
+        code = self.code
+        row, following, more, done = Value("%row", "i64"), "%row.next", code.name(), code.name()
+        code.jump("next")
+        code.label("next")
+        here = len(code.lines)
+        code.branch(code.op("icmp slt", "i64", row, Value("%batch", "i64"), result="i1"), more, done)
+        code.label(more)
+        with code.scope():
+            self._store(self.lowering.run(self.jaxpr, self._arguments(row)), row, None)
+        code.lines.append(f"{following} = add i64 {row.name}, %threads")
+        phi = f"{row.name} = phi i64 [ %first, %start ], [ {following}, %{code.block} ]"
+        code.lines.insert(here, phi)
+        code.jump("next")
+        code.label(done)
 
     def _batch(self, place: int | None) -> None:
         """All elements that this thread gets: threads take them from a counter, as they get on."""

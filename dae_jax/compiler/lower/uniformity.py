@@ -8,6 +8,7 @@ from typing import Any
 
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
+from .._compat import scan_counts
 from ..jaxprs.walk import called
 from ..thresholds import THRESHOLDS
 from ..types import Equation, Params
@@ -38,7 +39,7 @@ def results(eqn: Equation, args: list[bool], in_memory: bool = True) -> list[boo
         c, b = p["cond_nconsts"], p["body_nconsts"]
         return varying_in_loop(p, [args[:c], args[c : c + b], args[c + b :]], in_memory)
     if name == "scan":
-        c, k = p["num_consts"], p["num_carry"]
+        c, k = scan_counts(p)
         xs = [in_memory or x for x in args[c + k :]]
         carry = varying_in_scan(p["jaxpr"], [args[:c], args[c : c + k], xs], in_memory)
         ys = varying(p["jaxpr"], [*args[:c], *carry, *xs], in_memory)[k:]

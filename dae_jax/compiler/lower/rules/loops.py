@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
+from ..._compat import scan_counts
 from ...jaxprs.objects import objects
 from ...thresholds import THRESHOLDS
 from ..arrays import Operand, View
@@ -74,13 +75,11 @@ def while_(context: Context, *args: Operand, **p: Any) -> list[Any]:
 
 
 @rule("scan", ALL, cost=free, nested=True)
-def scan(
-    context: Context, *args: Operand, num_consts: int, num_carry: int, jaxpr: ClosedJaxpr, **_: object
-) -> list[Any]:
+def scan(context: Context, *args: Operand, jaxpr: ClosedJaxpr, **p: Any) -> list[Any]:
     """A known number of turns, written out where they are few."""
-    memory, start = context.memory, num_consts + num_carry
-    operands = list(map(memory.materialised, args))
-    consts, first, xs = operands[:num_consts], operands[num_consts:start], operands[start:]
+    memory, (count, carried) = context.memory, scan_counts(p)
+    start, operands = count + carried, list(map(memory.materialised, args))
+    consts, first, xs = operands[:count], operands[count:start], operands[start:]
     if is_written_out(context.eqn):
         with _retained(consts):
             return _written_out(context, jaxpr, consts, first, list(map(memory.entries, xs)))
@@ -93,7 +92,7 @@ def _scanned(
     context: Context, inner: ClosedJaxpr, consts: list[Operand], first: list[Operand], rows: Sequence[View]
 ) -> list[Any]:
     code, memory, p = context.code, context.memory, context.eqn.params
-    n, m = p["num_consts"], p["num_carry"]
+    n, m = scan_counts(p)
     ys = [memory.new(a.dtype, a.shape) for a in context.outs[m:]]
     own = varying_in_scan(inner, [_lanes(consts), _lanes(first), [True] * len(rows)]) if code.width > 1 else ()
     carry = Carry(memory, [v.aval for v in inner.jaxpr.invars[n : n + m]], first, own)
