@@ -27,14 +27,14 @@ def jit(
     static_argnums: int | Sequence[int] | None = None,
     static_argnames: str | Sequence[str] | None = None,
 ) -> "Jitted":
-    """`jax.jit(fn)`, compiled to one kernel on the CPU: for functions of small arrays, with loops of many turns.
+    """`jax.jit(fn)`, compiled to one kernel on the CPU or an NVIDIA GPU: for functions of small arrays, with loops of many turns.
 
     XLA runs the operations of a loop's body one after another and pays for each; here the whole loop is one function in
     machine code. A solve by `diffrax.diffeqsolve` is such a function.
 
     - `static_argnums`, `static_argnames`: as `jax.jit` has them.
 
-    Under `jax.vmap` the elements of the batch become lanes of vectors, on all cores. Derivatives in either mode and of any
+    Under `jax.vmap` the elements of the batch become lanes of vectors, on all cores; on a GPU threads. Derivatives in either mode and of any
     order, as far as `fn` has them, are compiled in the same way. Checks by `equinox.error_if` raise when the kernel is done.
     What cannot be one kernel is compiled by XLA as `jax.jit` does it, and so is everything on other backends;
     `jit(fn).lower(*args)` says which it is, and why.

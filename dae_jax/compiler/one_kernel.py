@@ -28,7 +28,7 @@ def one_kernel(
     pull_back: PullBack | None = None,
     forward: Callable[..., Any] | None = None,
 ) -> Callable[..., Any]:
-    """`fn` (pytrees of arrays to a pytree of arrays), compiled to one kernel on the CPU where it qualifies.
+    """`fn` (pytrees of arrays to a pytree of arrays), compiled to one kernel on the CPU or a GPU where it qualifies.
 
     On another backend, or where `hindrances` finds a reason, it is `fn` itself. Under `vmap` the batched function is
     looked at afresh. `derivative` says in which mode `fn` can be differentiated: its derivative is again one kernel

@@ -376,7 +376,7 @@ def test_long_chains_of_operations_are_cut():
 
 
 def test_what_our_compiler_stumbles_over_is_done_by_xla(monkeypatch):
-    def fails(*_):
+    def fails(*_, **__):
         raise ValueError("unforeseen")
 
     monkeypatch.setattr(kernel_call.lower, "compiled", fails)

@@ -213,7 +213,7 @@ class TestCompiling:
             object_code.object_code(broken, target.host())
 
     def test_what_is_given_up_is_said_once(self, monkeypatch, caplog):
-        def gives_up(*_):
+        def gives_up(*_, **__):
             raise Unsupported("a reason of its own")
 
         monkeypatch.setattr(fallbacks, "_reasons", type(fallbacks._reasons)())

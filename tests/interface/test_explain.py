@@ -81,8 +81,8 @@ def who_compiles(monkeypatch, fn, *args):
     found = []
     by_llvm = kernel_call._by_llvm
 
-    def noted(jaxpr, lanes, args):
-        out = by_llvm(jaxpr, lanes, args)
+    def noted(jaxpr, lanes, args, on_gpu):
+        out = by_llvm(jaxpr, lanes, args, on_gpu)
         if any(eqn.primitive.name == "while" and eqn.params["body_nconsts"] for eqn in equations(jaxpr)):
             found.append("llvm" if out is not None else "xla")
         return out

@@ -65,6 +65,10 @@ _LANCZOS = (
 )  # fmt: skip
 
 
+# From JAX 0.11 on.
+AT_ZERO = -math.inf if jax.__version_info__ >= (0, 11) else math.nan
+
+
 def digamma(x: Array, **_: object) -> Any:
     """The derivative of log Γ(x), by Lanczos' approximation; below 1/2 by reflection."""
     reflected = x < 0.5
@@ -78,7 +82,8 @@ def digamma(x: Array, **_: object) -> Any:
     # The cotangent of what is left of x: x itself would lose digits.
     rest = math.pi * (x + jnp.abs(jnp.floor(x + 0.5)))
     found = jnp.where(reflected, found - math.pi * jnp.cos(rest) / jnp.sin(rest), found)
-    return jnp.where((x <= 0) & (x == jnp.floor(x)), jnp.nan, found)
+    found = jnp.where((x <= 0) & (x == jnp.floor(x)), jnp.nan, found)
+    return jnp.where(x == 0, AT_ZERO, found)
 
 
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))

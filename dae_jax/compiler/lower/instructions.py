@@ -195,14 +195,6 @@ class Instructions:
             f"call {vector} {function}({', '.join(self.operand(x, kind, lanes) for x in xs)})", kind, lanes
         )
 
-    def extremum(self, name: str, kind: str, a: Number, b: Number) -> Value:
-        """`maximum` or `minimum` of two floats: NaN where one is, and 0 above −0."""
-        if kind == "float" or self.target is None or not self.target.is_gpu:
-            return self.intrinsic(name, kind, a, b)
-        # Of doubles a GPU has these but for NaN only; LLVM makes ten instructions of what these three are.
-        found = self.intrinsic(name.replace("imum", "num"), kind, a, b)
-        return self.select(self.op("fcmp uno", kind, a, b, result="i1"), np.nan, found, kind)
-
     def library(self, name: str, kind: str, *xs: Number) -> Value:
         """A function of the C library, lane by lane where it has none for vectors."""
         name = name if kind == "double" else f"{name}f"
