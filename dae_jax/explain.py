@@ -254,7 +254,7 @@ def explain(
 
 def _compiled(solve: Solve, jaxpr: ClosedJaxpr, starts: list[bool]) -> dict[str, Any]:
     """Who compiles a solve's loop, and why; `starts`: which of its arguments a batch of starts has lanes of."""
-    off = "off: derivatives through the loop, a progress meter, a switch, or no CPU"
+    off = "off: derivatives through the loop, a progress meter, a switch, or neither a CPU nor a GPU"
     if not one_kernel_enabled() or solve.derivative() == "any":
         return {"compiler": "xla", "batch_compiler": "xla", "reasons": (off,), "hindrances": ()}
     alone, batch = decision(jaxpr), decision(jaxpr, starts) if any(starts) else Decision("xla", ())

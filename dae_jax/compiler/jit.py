@@ -34,8 +34,9 @@ def jit(
 
     - `static_argnums`, `static_argnames`: as `jax.jit` has them.
 
-    Under `jax.vmap` the elements of the batch become lanes of vectors, on all cores; on a GPU threads. Derivatives in either mode and of any
-    order, as far as `fn` has them, are compiled in the same way. Checks by `equinox.error_if` raise when the kernel is done.
+    Under `jax.vmap` the elements of the batch become lanes of vectors, on all cores; on a GPU threads. Derivatives in either
+    mode and of any order, as far as `fn` has them, are compiled in the same way. Checks by `equinox.error_if` raise when the
+    kernel is done.
     What cannot be one kernel is compiled by XLA as `jax.jit` does it, and so is everything on other backends;
     `jit(fn).lower(*args)` says which it is, and why.
     """

@@ -46,12 +46,16 @@ class Decision:
 
 
 def decision(jaxpr: ClosedJaxpr, lanes: Sequence[bool] = ()) -> Decision:
-    """The decision of `called`; `lanes`: of a batch, in which these arguments have a leading axis."""
+    """Who compiles a function on JAX's default device; `lanes`: of a batch, in which these arguments have a leading axis."""
+    on_gpu = jax.default_backend() == "gpu"
+    target = gpu() if on_gpu else None
     try:
+        if on_gpu and target is None:
+            raise Unsupported("there is no GPU that kernels work on", primitive="system")
         kernel, used = _needed(jaxpr)
     except Unsupported as reason:
         return Decision("xla", (reason,))
-    return _decided(kernel, tuple(b for b, u in zip(lanes, used, strict=True) if u) if lanes else ())
+    return _decided(kernel, tuple(b for b, u in zip(lanes, used, strict=True) if u) if lanes else (), target)
 
 
 def hindrances(jaxpr: ClosedJaxpr) -> tuple[str, ...]:
@@ -67,8 +71,8 @@ def _decided(kernel: ClosedJaxpr, lanes: tuple[bool, ...], target: Target | None
         found = lower.unsupported(kernel, lanes, target)
     if not found:
         return Decision("llvm", ())
-    # Which form of a batch XLA takes depends on its size.
-    by_xla = current().compiler != "off" and not xla_kernel.hindrances(kernel)
+    # XLA's single kernels are the CPU's; which form of a batch it takes depends on its size.
+    by_xla = target is None and current().compiler != "off" and not xla_kernel.hindrances(kernel)
     return Decision("xla kernel" if by_xla else "xla", found)
 
 

@@ -294,6 +294,12 @@ class TestLaunch:
         monkeypatch.setattr(launch, "_kernels", {})
         assert "while" in self.lowered()
 
+    def test_what_is_said_of_it(self, driver, monkeypatch):
+        monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+        many = jax.make_jaxpr(lambda x: jnp.linalg.svd(x)[1])(jnp.ones((3, 3)))
+        found = [kernel_call.decision(jaxpr).compiler for jaxpr in (jax.make_jaxpr(loop)(jnp.ones(2)), many)]
+        assert found == ["llvm", "xla"]
+
     def lowered(self):
         fn = dae_jax.compiler.jit(loop)
         return jax.jit(jax.vmap(fn)).trace(np.ones((7, 2))).lower(lowering_platforms=("cuda",)).as_text()
@@ -313,8 +319,11 @@ class TestLaunch:
 
 
 class TestTrust:
-    def test_without_a_gpu(self):
+    def test_without_a_gpu(self, monkeypatch):
         assert on_gpu.gpu() is None
+        monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+        found = kernel_call.decision(jax.make_jaxpr(loop)(jnp.ones(2)))
+        assert (found.compiler, found.unsupported[0].reason) == ("xla", "there is no GPU that kernels work on")
 
     def test_a_self_test_that_fails_leaves_all_to_xla(self, driver, monkeypatch):
         def differs(*_):
