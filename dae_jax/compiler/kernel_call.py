@@ -22,7 +22,6 @@ from jaxtyping import Array, PyTree
 from . import fallbacks, lower, waiting, xla_kernel
 from ._compat import dce_jaxpr, setting
 from .check import checked
-from .emit.target import Target
 from .jaxprs.expansions import expanded, kernel_written_out
 from .jaxprs.scalar_interpreter import Unsupported
 from .jaxprs.unchecked import checks_dropped
@@ -47,15 +46,12 @@ class Decision:
 
 def decision(jaxpr: ClosedJaxpr, lanes: Sequence[bool] = ()) -> Decision:
     """Who compiles a function on JAX's default device; `lanes`: of a batch, in which these arguments have a leading axis."""
-    on_gpu = jax.default_backend() == "gpu"
-    target = gpu() if on_gpu else None
     try:
-        if on_gpu and target is None:
-            raise Unsupported("there is no GPU that kernels work on", primitive="system")
         kernel, used = _needed(jaxpr)
     except Unsupported as reason:
         return Decision("xla", (reason,))
-    return _decided(kernel, tuple(b for b, u in zip(lanes, used, strict=True) if u) if lanes else (), target)
+    kept = tuple(b for b, u in zip(lanes, used, strict=True) if u) if lanes else ()
+    return _decided(kernel, kept, jax.default_backend() == "gpu")
 
 
 def hindrances(jaxpr: ClosedJaxpr) -> tuple[str, ...]:
@@ -64,15 +60,17 @@ def hindrances(jaxpr: ClosedJaxpr) -> tuple[str, ...]:
     return tuple(dict.fromkeys(x.primitive for x in found.unsupported)) if found.compiler == "xla" else ()
 
 
-def _decided(kernel: ClosedJaxpr, lanes: tuple[bool, ...], target: Target | None = None) -> Decision:
+def _decided(kernel: ClosedJaxpr, lanes: tuple[bool, ...], on_gpu: bool = False) -> Decision:
     if current().compiler != "llvm":
         found = (Unsupported(f"our compiler is switched off: `compiler={current().compiler!r}`"),)
+    elif on_gpu and gpu() is None:
+        found = (Unsupported("there is no GPU that kernels work on", primitive="system"),)
     else:
-        found = lower.unsupported(kernel, lanes, target)
+        found = lower.unsupported(kernel, lanes, gpu() if on_gpu else None)
     if not found:
         return Decision("llvm", ())
     # XLA's single kernels are the CPU's; which form of a batch it takes depends on its size.
-    by_xla = target is None and current().compiler != "off" and not xla_kernel.hindrances(kernel)
+    by_xla = not on_gpu and current().compiler != "off" and not xla_kernel.hindrances(kernel)
     return Decision("xla kernel" if by_xla else "xla", found)
 
 
@@ -169,11 +167,10 @@ def _lowered(args: Sequence[Array], jaxpr: ClosedJaxpr, lanes: tuple[bool, ...],
 
 
 def _by_llvm(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Sequence[Array], on_gpu: bool) -> list[Any] | None:
-    target = gpu() if on_gpu else None
-    if (on_gpu and target is None) or _decided(jaxpr, lanes, target).compiler != "llvm":
+    if _decided(jaxpr, lanes, on_gpu).compiler != "llvm":
         return None
     try:
-        return lower.compiled(jaxpr, lanes, target=target)(*args)
+        return lower.compiled(jaxpr, lanes, target=gpu() if on_gpu else None)(*args)
     except Unsupported as reason:
         fallbacks.note(str(reason))
     except Exception as error:  # XLA can still do it

@@ -58,17 +58,13 @@ def _solve(turns: Array, x: Array) -> Array:
 
 def _test(to: Target, device: Any) -> None:
     """Raises where a batch is computed otherwise than by XLA."""
-    with jax.default_device(device), jax.ensure_compile_time_eval():
-        _compare(to)
-
-
-def _compare(to: Target) -> None:
     rng = np.random.default_rng(0)
     turns = rng.integers(0, 60, 1000).astype(np.int32)
     for dtype in (np.float32, np.float64) if setting("jax_enable_x64") else (np.float32,):
         x = rng.normal(size=(1000, 2)).astype(dtype)
         jaxpr = jax.make_jaxpr(_solve)(turns[0], x[0])
-        ours = jax.jit(lower.compiled(jaxpr, (True, True), target=to))(turns, x)
-        theirs = jax.jit(lambda *xs, jaxpr=jaxpr: kernel_written_out(*xs, jaxpr=jaxpr, lanes=(True, True)))(turns, x)
+        by_xla = functools.partial(kernel_written_out, jaxpr=jaxpr, lanes=(True, True))
+        with jax.default_device(device), jax.ensure_compile_time_eval():
+            ours, theirs = (jax.jit(f)(turns, x) for f in (lower.compiled(jaxpr, (True, True), target=to), by_xla))
         for k, (a, b) in enumerate(zip(ours, theirs, strict=True)):
             refuse_difference(k, np.asarray(a), np.asarray(b), UNITS)

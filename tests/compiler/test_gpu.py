@@ -180,7 +180,7 @@ class Driver:
         if self.refuses:
             raise Unsupported("the driver's compiler")
         assert f".entry {name}(" in code
-        return 7, cuda_driver.Function(1, 4, 4096, 32, 0, 2**30)
+        return 7, cuda_driver.Function(1, 4, 4096, 2**30)
 
     def context_of(self, stream):
         return 7
@@ -308,10 +308,10 @@ class TestLaunch:
         ("elements", "threads", "grid"), [(1, 4096, (1, 32)), (10**6, 4096, (64, 64)), (10**6, 96, (3, 32))]
     )
     def test_grids(self, elements, threads, grid):
-        assert cuda_driver.Function(1, 4, 4096, 32, 0, 2**30).grid(elements, threads) == grid
+        assert cuda_driver.Function(1, 4, 4096, 2**30).grid(elements, threads) == grid
 
     def test_room_is_a_part_of_the_memory(self):
-        function = cuda_driver.Function(1, 4, 4096, 32, 0, 2**30)
+        function = cuda_driver.Function(1, 4, 4096, 2**30)
         assert launch.Kernel({7: function}, 0, 2**16).room_for(10**6) == 2**16 * 2048
         assert launch.Kernel({7: function}, 0, 2**16).room_for(10) == 2**16 * 32
         with pytest.raises(Unsupported, match="of each thread"):

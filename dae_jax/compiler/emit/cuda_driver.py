@@ -10,22 +10,18 @@ from ..jaxprs.scalar_interpreter import Unsupported
 
 
 # cuda.h
-_MULTIPROCESSORS, _REGISTERS, _LOCAL_BYTES = 16, 4, 3
+_MULTIPROCESSORS = 16
 # Threads of a block: a warp while there are fewer elements than that gives every multiprocessor several.
 WARP, BLOCK, WARPS_EACH = 32, 64, 4
 
 
 @dataclasses.dataclass(frozen=True)
 class Function:
-    """A kernel on one device: `threads`, how many of it run at a time, its registers and bytes of memory a thread, and the bytes of
-    memory of the device.
-    """
+    """A kernel on one device: `threads`, how many of it run at a time; `memory`, the bytes that the device has."""
 
     handle: int
     multiprocessors: int
     threads: int
-    registers: int
-    local_bytes: int
     memory: int
 
     def grid(self, elements: int, threads: int) -> tuple[int, int]:
@@ -76,13 +72,12 @@ class Driver:
             self._call("cuModuleGetFunction", ctypes.byref(function), module, name.encode())
             blocks = self._number("cuOccupancyMaxActiveBlocksPerMultiprocessor", function, BLOCK, ctypes.c_size_t(0))
             count = self._number("cuDeviceGetAttribute", _MULTIPROCESSORS, handle)
-            registers, local = (self._number("cuFuncGetAttribute", k, function) for k in (_REGISTERS, _LOCAL_BYTES))
             self._call("cuDeviceTotalMem_v2", ctypes.byref(memory), handle)
         finally:
             self._call("cuCtxPopCurrent_v2", ctypes.byref(ctypes.c_void_p()))
         assert context.value is not None
         assert function.value is not None
-        return context.value, Function(function.value, count, blocks * count * BLOCK, registers, local, memory.value)
+        return context.value, Function(function.value, count, blocks * count * BLOCK, memory.value)
 
     def context_of(self, stream: int) -> int:
         """The context that a stream belongs to."""

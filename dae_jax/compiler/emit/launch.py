@@ -81,7 +81,7 @@ class Kernel:
 
 
 def register(module: str, target: Target, first: int | None) -> str:
-    """Compiles a module with a kernel `{name}.kernel`, and gives the name by which XLA calls it.
+    """Compiles a module with a kernel `{name}_kernel`, and gives the name by which XLA calls it.
 
     Errors: `Unsupported` for a module that is broken, or that the driver does not take.
     """

@@ -57,7 +57,7 @@ def kernel(body: list[str], arguments: int, results: int, room: int) -> list[str
 
 
 def bytes_of_room(text: str) -> int:
-    """How many bytes each thread of a module has of the buffer %room, which its last line but for comments says."""
+    """How many bytes each thread of a module has of the buffer %room, which `kernel` has noted in it."""
     found = re.search(r"^; room (\d+)", text, re.MULTILINE)
     return int(found[1]) if found else 0
 

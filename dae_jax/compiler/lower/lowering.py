@@ -56,7 +56,9 @@ class Lowering:
 
     def within(self, prefix: str) -> "Lowering":
         """A procedure of the same module, whose names begin so."""
-        inner = Lowering(self.code.width, self.memory.always_copies, self._limit, self.inlined, prefix)
+        inner = Lowering(
+            self.code.width, self.memory.always_copies, self._limit, self.inlined, prefix, self.code.target
+        )
         inner.procedures, inner.code.declared = self.procedures, self.code.declared
         inner.memory.constants = self.memory.constants
         return inner

@@ -29,8 +29,9 @@ def module_text(annotated: Annotated, always_copies: bool = False, limit: float 
 
     Errors: `TooLarge` for more than `limit` instructions, or arrays that take too much memory; none without a limit.
     """
-    place = main_loop(annotated.jaxpr) if any(annotated.batched) else None
-    if place is not None and not annotated.target.threads:
+    lanes = any(annotated.batched) and not annotated.target.threads
+    place = main_loop(annotated.jaxpr) if lanes else None
+    if place is not None:
         with contextlib.suppress(NotQueued):
             return _Module(annotated, always_copies, limit).text(place)
     return _Module(annotated, always_copies, limit).text(None)
