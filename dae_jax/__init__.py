@@ -49,6 +49,7 @@ from .solvers import (
     Gauss4 as Gauss4,
     Midpoint as Midpoint,
     OrthogonalProjection as OrthogonalProjection,
+    Radau as Radau,
     RadauIIA5 as RadauIIA5,
     RadauIIA9 as RadauIIA9,
     RadauIIA13 as RadauIIA13,

@@ -192,17 +192,17 @@ class LinearisedResidual(eqx.Module):
         size = jnp.minimum(jnp.abs(h), 1)
         indices = np.array(self.structure.indices)
         weights = powers(size, tuple(np.maximum(indices - 1, 0).tolist()))
-        seen = self._followed
+        seen = self.followed
         return weights * jnp.where(seen, jnp.clip(raised, 1, 1 / size), 1) if seen.any() else weights
 
     def between(self, dense: bool) -> Bool[np.ndarray, " n"]:
         """Of which variables the way between the ends of a step counts: the user's of index 2 and higher, which follow from
         derivatives; with `dense` all of the user's.
         """
-        return self.form.shown & (dense | self._followed)
+        return self.form.shown & (dense | self.followed)
 
     @property
-    def _followed(self) -> Bool[np.ndarray, " n"]:
+    def followed(self) -> Bool[np.ndarray, " n"]:
         """Which of the user's variables of index 2 and higher are controlled by themselves."""
         return self.form.independent & (np.array(self.structure.indices) > 1)
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..consistent import consistent_state
 from ..systems import ConstrainedSystem
@@ -43,14 +43,20 @@ def assembled(
     start = _start(mechanism, guess)
     found = _closed(mechanism, _with_values(mechanism, at, rates, t0), start, t0, args)
     if not isinstance(found[0].values, Tracer):
-        configuration = mechanism.configuration(found[0])
-        for joint in mechanism.joints:
-            if isinstance(joint, Joint) and joint.is_reversed(configuration):
+        for name, is_reversed in _reversed(mechanism, found[0]).items():
+            if is_reversed:
                 raise ValueError(
-                    f"From this guess joint {joint.name!r} closes the wrong way round, its axes against each other: turn the bodies "
+                    f"From this guess joint {name!r} closes the wrong way round, its axes against each other: turn the bodies "
                     "of the guess nearer to how they are to be."
                 )
     return found
+
+
+@eqx.filter_jit
+def _reversed(mechanism: "Mechanism", q: Coordinates) -> dict[str, Bool[Array, ""]]:
+    """Which lower pairs have closed the wrong way round."""
+    at = mechanism.configuration(q)
+    return {joint.name: joint.is_reversed(at) for joint in mechanism.joints if isinstance(joint, Joint)}
 
 
 def _closed(

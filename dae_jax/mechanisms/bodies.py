@@ -14,10 +14,12 @@ As eᵀë = −|ė|² and E e = 0, the terms of c cancel on the constraint: it c
 size. Source: P. E. Nikravesh, *Computer-Aided Analysis of Mechanical Systems*, ch. 8; A. A. Shabana, *Computational Dynamics*, ch. 7.
 """
 
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -150,6 +152,8 @@ def velocities(q: Float[Array, " k"], velocity: Float[Array, " d"], spin: Float[
     return jnp.concatenate([velocity, rotate_back(rates(e), rotate_back(matrix(e), spin)) / 2])
 
 
+# Where the bodies of a mechanism are asked for one by one, it would be compiled operation by operation.
+@functools.partial(jax.jit, inline=True)
 def pose(q: Float[Array, " k"]) -> Pose:
     """Where a body is at q."""
     if dimension(q) == 2:

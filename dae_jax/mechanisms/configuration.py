@@ -1,5 +1,6 @@
 """All bodies at one instant: poses and twists by name; markers, which are points with axes on a body; coordinates of joints."""
 
+import functools
 from typing import Literal, TypeAlias
 
 import equinox as eqx
@@ -173,6 +174,10 @@ def axis_of(dimension: int) -> int:
 
 def marker(body: Body | Ground, point: Float[Array, " d"], frame: Float[Array, "d d"]) -> Marker:
     """The marker that is at a point of the world, with these axes, in the reference configuration."""
-    place = reference_pose(body, point.shape[0])
+    return Marker(body.name, *_in_body_axes(reference_pose(body, point.shape[0]), point, frame))
+
+
+@functools.partial(jax.jit, inline=True)
+def _in_body_axes(place: Pose, point: Float[Array, " d"], frame: Float[Array, "d d"]) -> MarkerArrays:
     axes = jnp.sum(place.rotation[:, :, None] * frame[:, None, :], 0)
-    return Marker(body.name, place.local(point), axes, jnp.zeros(()) if place.angle is None else place.angle)
+    return place.local(point), axes, jnp.zeros(()) if place.angle is None else place.angle

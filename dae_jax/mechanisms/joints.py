@@ -22,7 +22,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..types import Args, Time
 from .bodies import Body, Numbers
@@ -103,11 +103,12 @@ class Joint(AbstractHolonomicJoint):
     def constraint(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
         return pairs([self], at)
 
-    def is_reversed(self, at: Configuration) -> bool:
+    def is_reversed(self, at: Configuration) -> Bool[Array, ""]:
         """Whether axes point against each other that go together: the equations, that they are perpendicular to others, allow both."""
         pairs = set(self.perpendicular) if at.dimension == 3 else set()
         axes = [2] * ({(0, 2), (1, 2)} <= pairs) + [0] * ({(0, 2), (1, 2), (0, 1)} <= pairs)
-        return any(float(jnp.sum(self.on_a.axis(at, i) * self.on_b.axis(at, i))) < 0 for i in axes)
+        facing = [jnp.sum(self.on_a.axis(at, i) * self.on_b.axis(at, i)) for i in axes]
+        return jnp.any(jnp.stack([jnp.ones(()), *facing]) < 0)
 
     @property
     def coordinates(self) -> dict[Kind, Coordinate]:

@@ -3,6 +3,9 @@
 Source: P. E. Nikravesh, *Computer-Aided Analysis of Mechanical Systems*, ch. 6 (Euler parameters); its L is E here.
 """
 
+import functools
+
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -41,6 +44,7 @@ def plane(angle: Float[Array, ""]) -> Float[Array, "2 2"]:
     return jnp.stack([jnp.stack([c, -s]), jnp.stack([s, c])])
 
 
+@functools.partial(jax.jit, inline=True)
 def frame(axis: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """Columns x, y, z of a right-handed orthonormal frame with z along `axis`; the unit matrix for the z axis.
 

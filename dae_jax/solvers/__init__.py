@@ -17,6 +17,7 @@ from .manifold import AbstractManifoldSolver as AbstractManifoldSolver
 from .midpoint import Midpoint as Midpoint
 from .orthogonal_projection import OrthogonalProjection as OrthogonalProjection
 from .radau import RadauIIA5 as RadauIIA5, RadauIIA9 as RadauIIA9, RadauIIA13 as RadauIIA13
+from .radau_variable_order import Radau as Radau
 from .rattle import RATTLE as RATTLE
 from .residual_steps import AbstractResidualSolver as AbstractResidualSolver, first_step as first_step
 from .selected_states import SelectedResiduals as SelectedResiduals, SelectedStates as SelectedStates

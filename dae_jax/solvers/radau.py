@@ -20,6 +20,7 @@ from .residual_steps import (
     SAFETY,
     AbstractResidualSolver,
     Iteration,
+    Newton,
     Tolerances,
     Work,
     at_min_step,
@@ -51,9 +52,12 @@ GROWTH = 10
 # Where a factorisation takes as long as many steps, a step that could grow by no more than this keeps its size (the program
 # RADAU5).
 WORTHWHILE = 1.2
+# The rate θ of Newton's method that a step may be expected to have, and the power of h that θ grows with, seen where many stages take
+# the Jacobian of one.
+CONTRACTS, STEEP = 0.2, 3
 
 
-class _State(NamedTuple):
+class RadauState(NamedTuple):
     """What a step leaves to the next.
 
     `z`, `h`: stages and size of the last step, h = 0 before the first; `rates`: ẏ at its end; `jacobians`, `factors`
@@ -93,18 +97,19 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
     def error_order(self, terms: diffrax.AbstractTerm) -> int:
         return self.stages + 1
 
-    def _tolerances(self, dtype: Any) -> Tolerances:
+    def fitted_tolerances(self, dtype: Any) -> Tolerances:
+        """Those of the controller, with patience for the number of stages."""
         tol = tolerances(self.rtol, self.atol, dtype)
         return tol._replace(corrections=tol.corrections + int(PATIENCE * (self.stages - 3)))
 
-    def init(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any) -> _State:
+    def init(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any) -> RadauState:
         sign = time_sign(terms, t0, t1)
         zero = jnp.zeros((), y0.dtype)
         step = Step(coefficients(self.stages), args, sign, t0, t1, y0)
-        tol = self._tolerances(y0.dtype)
+        tol = self.fitted_tolerances(y0.dtype)
         unused = jax.eval_shape(lambda: (j := step.jacobians(t0, y0, y0), step.factor(j, tol)))
         jacobians, factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), unused)
-        return _State(
+        return RadauState(
             jnp.zeros((self.stages, y0.size), y0.dtype),
             zero,
             args.start,
@@ -116,7 +121,7 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
             Work.none(),
         )
 
-    def invalidate_jacobian(self, state: _State) -> _State:
+    def invalidate_jacobian(self, state: RadauState) -> RadauState:
         return state._replace(refresh=jnp.ones_like(state.refresh))
 
     def step(
@@ -126,14 +131,14 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
         t1: Time,
         y0: Any,
         args: Any,
-        solver_state: _State,
+        solver_state: RadauState,
         made_jump: BoolLike,
     ) -> Any:
         state = solver_state._replace(
             refresh=solver_state.refresh | made_jump, h=jnp.where(made_jump, 0, solver_state.h)
         )
         step = Step(coefficients(self.stages), args, time_sign(terms, t0, t1), t0, t1, y0)
-        tol = self._tolerances(y0.dtype)
+        tol = self.fitted_tolerances(y0.dtype)
         z, (newton, jacobians, factors, work) = _stages(lambda params: _solve(*params), (step, constant(state), tol))
         y1 = y0 + z[-1]
         scaled = counted = _error(*constant((step, factors.real, z)), tol=tol) * args.weights(step.h)
@@ -147,21 +152,27 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
         scaled = jnp.where(smallest, bend, counted)
         error = tol.norm(scaled, y0, y1)
         failure = of_step(newton.converged, factors.probe.determined, error)
-        scaled = scaled * self._held(args, error)
+        scaled = scaled * self._held(args, error, newton)
         y1, scaled, result = at_min_step(failure, t0, t1, y0, y1, scaled)
         slow = (newton.theta > FAST) & (newton.count > 1)
         # What jumped says nothing of the next step.
         size = jnp.where(smallest, 0, step.h)
-        new = _State(z, size, rates, jacobians, factors, size, slow, newton.eta, work)
+        new = RadauState(z, size, rates, jacobians, factors, size, slow, newton.eta, work)
         return y1, scaled, {"y0": y0, "z": z}, constant(new), result
 
-    def _held(self, linearised: Any, error: Any) -> Any:
-        """By what to multiply an error from which a larger size would follow that is not worth new factors."""
-        if not linearised.storage.dear:
-            return 1.0
+    def _held(self, linearised: Any, error: Any, newton: Newton) -> Any:
+        """By what to multiply an error from which a larger size would follow than Newton's method goes with, or one that is not worth
+        new factors.
+        """
         order = self.stages + 1
-        same = SAFETY**order
-        return jnp.where((error <= same) & (error >= same / WORTHWHILE**order), same / error, 1)
+        size = lambda growth: (SAFETY / growth) ** order
+        growth = jnp.where(newton.count > 1, (CONTRACTS / newton.theta) ** (1 / STEEP), GROWTH)
+        least = size(jnp.clip(growth, 1, GROWTH))
+        held = jnp.where((error > 0) & (error < least), least / error, 1)
+        if not linearised.storage.dear:
+            return held
+        unworthy = (error * held <= size(1)) & (error * held >= size(WORTHWHILE))
+        return jnp.where(unworthy, size(1) / error, held)
 
     def replay(
         self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any, history: Any, dense: Any
@@ -260,7 +271,7 @@ class RadauIIA13(AbstractRadauIIA):
     stages: ClassVar[int] = 7
 
 
-def _predicted(state: _State, h: Any) -> Float[Array, "s n"]:
+def _predicted(state: RadauState, h: Any) -> Float[Array, "s n"]:
     """The stages on the last step's polynomial; 0 without one, or where it does not reach."""
     method = coefficients(len(state.z))
     ratio = h / jnp.where(state.h == 0, 1, state.h)
@@ -271,13 +282,14 @@ def _predicted(state: _State, h: Any) -> Float[Array, "s n"]:
     return jnp.where(none, 0, ahead)
 
 
-def _solve(step: Step, state: _State, tol: Tolerances) -> Any:
+def _solve(step: Step, state: RadauState, tol: Tolerances) -> Any:
     """The stages, and how they were found: with the Jacobian at hand first, with new ones where these fail, and in the
     smallest step with new ones for each correction.
     """
     h, smallest = step.h, step.smallest
     predicted = jnp.where(smallest, 0, _predicted(state, h))
     weights, differential = step.linearised.weights(h, tol.raised()), step.linearised.structure.differential
+    pace = step.linearised.weights(h) / tol.scale(step.y0) if step.linearised.followed.any() else None
 
     def attempt(carry: Any) -> Any:
         tries, fresh, before, _, jacobians, factors, work = carry
@@ -296,7 +308,7 @@ def _solve(step: Step, state: _State, tol: Tolerances) -> Any:
         newton = lax.cond(
             smallest & (tries > 0),
             lambda: corrected(iteration, start, tries, scale, differential, state.eta, tol),
-            lambda: simplified_newton(iteration, start, weights / tol.scale(step.y0), state.eta, tol),
+            lambda: simplified_newton(iteration, start, weights / tol.scale(step.y0), state.eta, tol, pace),
         )
         work = work.and_of(renew, refactor, newton.count)
         seen = before.converged | step.determines(factors, newton.x)
@@ -331,7 +343,7 @@ def _error(step: Step, factor: Any, z: Any, tol: Tolerances) -> Float[Array, " n
     return lax.while_loop(again, estimate, (0, jnp.zeros_like(step.y0), jnp.zeros_like(step.h)))[1]
 
 
-def _between(method: Coefficients, state: _State, h: Any, z: Any) -> Float[Array, " n"]:
+def _between(method: Coefficients, state: RadauState, h: Any, z: Any) -> Float[Array, " n"]:
     """The largest error of the polynomial through the step's points, by the start of the step before."""
     # 1 where there was none, which is as good as any.
     before = reach = -jnp.where(state.h == 0, 1, state.h / h)

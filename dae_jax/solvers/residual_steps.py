@@ -181,8 +181,13 @@ class Iteration(NamedTuple):
         return left, jnp.all(jnp.abs(rows) <= jnp.maximum(moved, self.round_off))
 
 
-def simplified_newton(iteration: Iteration, start: Any, scale: Any, eta: Any, tol: Tolerances) -> Newton:
+def simplified_newton(
+    iteration: Iteration, start: Any, scale: Any, eta: Any, tol: Tolerances, pace: Any = None
+) -> Newton:
     """Corrects `start` until what remains, η ‖Δx‖, is small beside the tolerance; ‖Δx‖ is that of Δx · `scale`.
+
+    `pace`: the scale in which the method contracts, where that is another: a variable of index k counts h^(k−1) in it. What a
+    correction leaves of the others is divided by h^(k−1) in these, so that the first one tells nothing of them.
 
     Source: E. Hairer, G. Wanner, *Solving Ordinary Differential Equations II*, section IV.8.
     """
@@ -199,18 +204,20 @@ def simplified_newton(iteration: Iteration, start: Any, scale: Any, eta: Any, to
         size = rms_norm(dx * scale)
         allowed = jnp.minimum(jnp.where(s.count == 0, FIRST_LEFT, LEFT), UNSOLVED / size)
         left, trusted = iteration.after(x, dx, off, allowed)
-        theta = size / jnp.maximum(s.last, jnp.finfo(start.dtype).tiny)
+        step = size if pace is None else rms_norm(dx * pace)
+        theta = step / jnp.maximum(s.last, jnp.finfo(start.dtype).tiny)
         first = s.count == 0
         eta = jnp.where(first, jnp.maximum(s.eta, 1e-3) ** 0.8, theta / jnp.maximum(1 - theta, epsilon))
         remaining = tol.corrections - 1 - s.count
         stagnant = ~first & (theta >= 1)
-        hopeless = stagnant | (eta * size * theta**remaining > tol.newton) & (size > NOISE)
+        hopeless = stagnant | (eta * step * theta**remaining > tol.newton) & (step > NOISE)
         # A correction that does not shrink any more but is small is round-off.
-        small = (eta * size <= tol.newton) & ~stagnant | (size <= tol.roundoff) | (stagnant & (size <= NOISE))
+        known = ~stagnant if pace is None else ~stagnant & ~first
+        small = (eta * size <= tol.newton) & known | (size <= tol.roundoff) | (stagnant & (size <= NOISE))
         converged = small & trusted
         diverged = ~jnp.isfinite(size) | (~first & hopeless & ~converged & (not tol.patient))
         theta = jnp.where(first, 0, theta)
-        return Newton(x, s.count + 1, size, eta, theta, converged & jnp.isfinite(size), diverged, s.carried), left
+        return Newton(x, s.count + 1, step, eta, theta, converged & jnp.isfinite(size), diverged, s.carried), left
 
     return lax.while_loop(goes_on, correct, (not_begun(start, eta), iteration.residual(start)))[0]
 
