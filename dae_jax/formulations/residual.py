@@ -13,7 +13,7 @@ from .interface import AbstractResidualFormulation
 
 
 class Residual(AbstractResidualFormulation):
-    """No equation is differentiated by hand: 0 = F(t, y, ẏ), for `RadauIIA5`, `RadauIIA9`, `RadauIIA13` and `BDF`.
+    """No equation is differentiated by hand: 0 = F(t, y, ẏ), for `RadauIIA5`, `RadauIIA9`, `RadauIIA13`, `Radau` and `BDF`.
 
     **Arguments**
 

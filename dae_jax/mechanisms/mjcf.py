@@ -24,6 +24,17 @@ FREE, BALL, SLIDE, HINGE = range(4)
 CONNECT, WELD, JOINT = range(3)
 # Axes count as parallel or perpendicular, and points as one, up to this.
 NEAR = 1e-6
+# Fields of the model that are read, follow from others, or have no part in a motion without contacts, limits and actuators. What
+# MuJoCo has besides, and has in later versions, is refused by its name where it is set.
+KNOWN = {
+    "jnt": "actfrclimited actfrcrange actgravcomp actuatorid axis bodyid dofadr group limited margin pos qposadr range solimp solref "
+    "stiffness type user",
+    "dof": "M0 Madr bodyid damping invweight0 jntid length parentid simplenum solimp solref treeid",
+    "eq": "active0 data obj1id obj2id objtype solimp solref type",
+    "body": "bvhadr bvhnum conaffinity contype dofadr dofnum geomadr geomnum inertia invweight0 ipos iquat jntadr jntnum margin "
+    "mass mocapid parentid pos quat rootid sameframe simple subtreemass treeid user weldid",
+}
+OWNERS = {"jnt": "joint", "eq": "equality", "body": "body"}
 
 
 def read_mjcf(source: str | os.PathLike[str]) -> Mechanism:
@@ -32,7 +43,8 @@ def read_mjcf(source: str | os.PathLike[str]) -> Mechanism:
     Bodies that are welded to each other are one. Hinge, slide, ball and free joints, a hinge and a slide along one axis (`cylindrical`),
     two perpendicular hinges through one point (`universal`), springs and dampers of joints, equality constraints `connect`,
     `weld` and `joint`, and gravity are taken over; loops are closed exactly, where MuJoCo's are soft. Names are those of
-    the file; what has none is "body 3", "joint 0" or "equality 1".
+    the file; what has none is "body 3", "joint 0" or "equality 1", and of two that have the same, a joint and an equality,
+    the second is "equality pin".
 
     **Arguments**
 
@@ -65,13 +77,14 @@ class _Reader:
         self.joints: list[AbstractJoint] = []
         self.loads: list[AbstractLoad | AbstractJoint] = []
         self.coordinates: dict[int, Coordinate] = {}
+        self.names = self._unique_names()
         data.qpos[:] = model.qpos0
         mujoco.mj_kinematics(model, data)
         self._refuse_other_physics()
         self.bodies = {int(i): body for i in np.unique(model.body_weldid) if i and (body := self._body(int(i)))}
         for i in self.bodies:
             self._joints_of(i)
-        for k in range(model.neq if not self._disabled("EQUALITY") else 0):
+        for k in range(0 if self._disabled("EQUALITY", "CONSTRAINT") else model.neq):
             self._equality(k)
         if not self._disabled("GRAVITY") and np.any(model.opt.gravity):
             self.loads.append(loads.gravity(model.opt.gravity))
@@ -81,9 +94,26 @@ class _Reader:
         bits = [getattr(self.mujoco.mjtDisableBit, f"mjDSBL_{flag}", 0) for flag in flags]
         return any(self.model.opt.disableflags & int(bit) for bit in bits)
 
+    def _unique_names(self) -> dict[tuple[str, int], str]:
+        """Of bodies, and of joints and equalities together; MuJoCo has names of their own for each."""
+        found: dict[tuple[str, int], str] = {}
+        for kinds, taken in ((("body",), {ground.name}), (("joint", "equality"), set())):
+            counts = {"body": self.model.nbody, "joint": self.model.njnt, "equality": self.model.neq}
+            known = [(kind, k) for kind in kinds for k in range(counts[kind])]
+            # Names that the file gives come first.
+            for kind, k in sorted(known, key=lambda part: not self._given(*part)):
+                name = self._given(kind, k) or f"{kind} {k}"
+                while name in taken:
+                    name = f"{kind} {name}"
+                taken.add(name)
+                found[kind, k] = name
+        return found
+
+    def _given(self, kind: str, k: int) -> str:
+        return self.mujoco.mj_id2name(self.model, getattr(self.mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), k) or ""
+
     def _name(self, kind: str, k: int) -> str:
-        of = {"body": "BODY", "joint": "JOINT", "equality": "EQUALITY", "geom": "GEOM", "actuator": "ACTUATOR"}[kind]
-        return self.mujoco.mj_id2name(self.model, getattr(self.mujoco.mjtObj, f"mjOBJ_{of}"), k) or f"{kind} {k}"
+        return self.names.get((kind, k)) or self._given(kind, k) or f"{kind} {k}"
 
     def _refuse_other_physics(self) -> None:
         model = self.model
@@ -91,13 +121,28 @@ class _Reader:
             (model.ntendon, "tendons"),
             (model.nflex, "flexible bodies"),
             (model.nmocap, "mocap bodies"),
+            (getattr(model, "nplugin", 0), "plugins"),
         ):
             if count:
                 self.unsupported.append(f"{count} {what}")
+        for kind, known in KNOWN.items():
+            for field in sorted(x for x in dir(model) if x.startswith(f"{kind}_")):
+                if field.removeprefix(f"{kind}_") not in known.split():
+                    self._refuse_field(kind, field)
         if model.opt.density or model.opt.viscosity:
             self.unsupported.append("a fluid around the bodies (density, viscosity)")
-        for i in np.flatnonzero(model.body_gravcomp):
-            self.unsupported.append(f"gravity compensation of body {self._name('body', int(i))!r}")
+
+    def _refuse_field(self, kind: str, field: str) -> None:
+        """What is set (0 and −1 are nothing) of a field that is not known."""
+        rows = np.asarray(getattr(self.model, field))
+        if rows.ndim == 0 or (field == "dof_frictionloss" and self._disabled("FRICTIONLOSS", "CONSTRAINT")):
+            return
+        owners = np.flatnonzero(((rows != 0) & (rows != -1)).reshape(len(rows), -1).any(1))
+        if kind == "dof":
+            owners = np.unique(self.model.dof_jntid[owners])
+        for k in owners:
+            owner = OWNERS.get(kind, "joint")
+            self.unsupported.append(f"{field.removeprefix(kind + '_')} of {owner} {self._name(owner, int(k))!r}")
 
     def _body(self, i: int) -> Body | None:
         """All that is welded to body i, about their common centre of mass, in axes that are the world's at `qpos0`."""
@@ -157,15 +202,10 @@ class _Reader:
         return bool(np.linalg.norm(self.data.xanchor[ids[0]] - self.data.xanchor[ids[1]]) < NEAR)
 
     def _forces_of(self, j: int) -> None:
-        """Springs and dampers of a joint; what else acts there is not supported."""
+        """Springs and dampers of a joint."""
         model, name = self.model, self._name("joint", j)
         start = int(model.jnt_dofadr[j])
         dofs = slice(start, start + {FREE: 6, BALL: 3}.get(int(model.jnt_type[j]), 1))
-        for field in ("dof_armature", "dof_frictionloss", "dof_dampingpoly"):
-            if np.any(getattr(model, field, np.zeros(model.nv))[dofs]):
-                self.unsupported.append(f"{field.removeprefix('dof_')} of joint {name!r}")
-        if np.any(getattr(model, "jnt_stiffnesspoly", np.zeros(model.njnt))[j]):
-            self.unsupported.append(f"stiffnesspoly of joint {name!r}")
         stiffness = 0.0 if self._disabled("SPRING", "PASSIVE") else float(model.jnt_stiffness[j])
         damping = 0.0 if self._disabled("DAMPER", "PASSIVE") else float(model.dof_damping[start])
         if j not in self.coordinates:
@@ -197,13 +237,16 @@ class _Reader:
         a, b = self._part(one), self._part(two)
         if a is None or b is None:
             return
-        turns = data.xmat.reshape(-1, 3, 3)
-        if kind == CONNECT:
-            points = [data.xpos[i] + turns[i] @ p for i, p in ((one, numbers[:3]), (two, numbers[3:6]))]
+        turns, on_two = data.xmat.reshape(-1, 3, 3), numbers[3:6] if kind == CONNECT else numbers[:3]
+        # Of a weld without a torque only the points are one.
+        if kind == CONNECT or numbers[10] == 0:
+            on_one = numbers[:3] if kind == CONNECT else numbers[3:6]
+            points = [data.xpos[i] + turns[i] @ p for i, p in ((one, on_one), (two, on_two))]
             local = tuple(p - (x.at if isinstance(x, Body) else 0) for p, x in zip(points, (a, b), strict=True))
             self.joints.append(joints.spherical(a, b, anchors=(local[0], local[1]), name=name))
             return
-        place, turn = turns[one].T @ (data.xpos[two] - data.xpos[one]), np.zeros(9)
+        at, turn = data.xpos[two] + turns[two] @ on_two, np.zeros(9)
+        place = turns[one].T @ (at - data.xpos[one])
         self.mujoco.mju_quat2Mat(turn, numbers[6:10])
         as_it_is = np.allclose(place, numbers[3:6], atol=NEAR) and np.allclose(
             turns[one].T @ turns[two], turn.reshape(3, 3), atol=NEAR
@@ -211,7 +254,7 @@ class _Reader:
         if not as_it_is:
             self.unsupported.append(f"weld {name!r}, whose relative pose is not that of `qpos0`")
             return
-        self.joints.append(joints.fixed(a, b, data.xpos[two] + turns[two] @ numbers[:3], name=name))
+        self.joints.append(joints.fixed(a, b, at, name=name))
 
     def _joint_equality(self, name: str, one: int, two: int, numbers: Float[np.ndarray, " k"]) -> None:
         if one not in self.coordinates or (two >= 0 and two not in self.coordinates):
@@ -231,17 +274,15 @@ class _Reader:
         """What is no part of a mechanism, by name."""
         model = self.model
         limited = [self._name("joint", int(j)) for j in np.flatnonzero(model.jnt_limited)]
-        touching = [
-            self._name("geom", int(k))
-            for k in np.flatnonzero(np.logical_or(model.geom_contype, model.geom_conaffinity))
-        ]
-        disabled = self._disabled("CONTACT")
+        touching = np.logical_or(model.geom_contype, model.geom_conaffinity)
+        touching[[*model.pair_geom1, *model.pair_geom2]] = True
+        in_contact = [self._name("geom", int(k)) for k in np.flatnonzero(touching)]
         driven = [self._name("actuator", k) for k in range(model.nu)]
         idle = [self._name("equality", int(k)) for k in np.flatnonzero(~model.eq_active0.astype(bool))]
         for what, names in (
-            ("limits of", limited),
-            ("contacts of", [] if disabled else touching),
-            ("actuators", driven),
+            ("limits of", limited * (not self._disabled("LIMIT", "CONSTRAINT"))),
+            ("contacts of", in_contact * (not self._disabled("CONTACT", "CONSTRAINT"))),
+            ("actuators", driven * (not self._disabled("ACTUATION"))),
             ("inactive equalities", idle),
         ):
             if names:

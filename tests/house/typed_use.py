@@ -90,6 +90,7 @@ def methods() -> list[diffrax.AbstractSolver[Any]]:
     ]
     of_residuals: list[dae_jax.AbstractResidualSolver] = [
         dae_jax.RadauIIA5(),
+        dae_jax.Radau(),
         dae_jax.RadauIIA9(),
         dae_jax.RadauIIA13(),
         dae_jax.BDF(),

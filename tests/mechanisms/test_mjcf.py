@@ -112,3 +112,86 @@ def test_what_would_have_to_count_turns_is_refused(old, new, said):
     wheel = '<body name="wheel" pos="3 0 1"><joint name="wheel" axis="0 0 1"/><geom size=".1" mass="1"/></body>'
     with pytest.raises(ValueError, match=said):
         m.read_mjcf(PENDULUM.replace('<body name="arm"', wheel + '<body name="arm"').replace(old, new))
+
+
+FREE_BODY = """<mujoco><option gravity="0 0 -9.81" timestep="5e-5"><flag contact="disable"/></option><worldbody><body name="a" pos="0 0 1"/>
+<body name="b" pos="1 0 1"><freejoint/><geom size=".1" mass="1" pos=".5 0 0"/></body></worldbody><equality>{}</equality></mujoco>"""
+
+
+class TestWelds:
+    """A weld holds the anchor, a point of the second body, at the relative pose."""
+
+    def test_with_an_anchor_that_fits_it_is_fixed(self):
+        mechanism = m.read_mjcf(FREE_BODY.format('<weld body1="a" body2="b" anchor=".1 .2 .3"/>'))
+        assert mechanism.rank(mechanism.assemble())[1] == 7
+
+    def test_with_an_anchor_elsewhere_it_is_refused(self):
+        weld = '<weld name="w" body1="a" body2="b" anchor=".1 .2 .3" relpose="1 0 0 1 0 0 0"/>'
+        with pytest.raises(ValueError, match="weld 'w', whose relative pose"):
+            m.read_mjcf(FREE_BODY.format(weld))
+
+    @pytest.mark.slow
+    def test_without_a_torque_it_is_a_ball_joint(self):
+        text = FREE_BODY.format('<weld body1="a" body2="b" torquescale="0"/>')
+        mechanism = m.read_mjcf(text)
+        solver = dae_jax.OrthogonalProjection(dae_jax.DOP853())
+        sol = dae_jax.daesolve(mechanism.system(), solver, 0.0, 0.3, None, mechanism.assemble())
+        model = mujoco.MjModel.from_xml_string(text)
+        data = mujoco.MjData(model)
+        mujoco.mj_step(model, data, nstep=6000)
+        # MuJoCo's weld is soft.
+        np.testing.assert_allclose(sol.ys[0]["b"][-1][:3], data.geom_xpos[0], atol=1e-3)
+
+
+def test_constraints_that_are_switched_off_are():
+    """Two arms that hold each other, were it not for the flag; and nothing is left out that MuJoCo would have."""
+    arm = '<body name="{}" pos="{} 0 0"><joint name="{}" axis="0 1 0" range="-9 9"/><geom size=".1" mass="1" pos=".5 0 0"/></body>'
+    arms = arm.format("a", 0, "y") + arm.format("b", 1, "z")
+    text = '<mujoco><option><flag constraint="disable"/></option><worldbody>{}</worldbody><equality>{}</equality></mujoco>'
+    mechanism = m.read_mjcf(text.format(arms, '<joint joint1="y" joint2="z" polycoef="0 -1 0 0 0"/>'))
+    assert [joint.name for joint in mechanism.joints] == ["y", "z"]
+
+
+@pytest.mark.parametrize(
+    ("where", "what", "said"),
+    [
+        ("<joint ", 'springyield="5" ', "springyield of joint 'g'"),
+        ("<joint ", 'armature="1" ', "armature of joint 'g'"),
+        ('name="b" ', 'gravcomp="1" ', "gravcomp of body 'b'"),
+    ],
+)
+def test_what_is_not_known_is_not_passed_over(where, what, said):
+    text = """<mujoco><worldbody><body name="b" pos="0 0 1"><joint name="g" axis="0 1 0" stiffness="30"/><geom size=".1"
+    contype="0" conaffinity="0" pos=".5 0 0"/></body></worldbody></mujoco>"""
+    m.read_mjcf(text)
+    with pytest.raises(ValueError, match=said):
+        m.read_mjcf(text.replace(where, where + what))
+
+
+def test_fields_of_a_later_version_are_refused_where_they_are_set(monkeypatch):
+    from dae_jax.mechanisms import mjcf
+
+    known = {**mjcf.KNOWN, "jnt": mjcf.KNOWN["jnt"].replace("stiffness ", "")}
+    monkeypatch.setattr(mjcf, "KNOWN", known)
+    with pytest.raises(ValueError, match="stiffness of joint 'hinge'"):
+        m.read_mjcf(PENDULUM)
+
+
+def test_a_pair_in_contact_is_named():
+    text = """<mujoco><worldbody><geom name="floor" type="plane" size="1 1 1" contype="0" conaffinity="0"/><body pos="0 0 .2">
+    <freejoint/><geom name="ball" size=".1" contype="0" conaffinity="0"/></body></worldbody>
+    <contact><pair geom1="floor" geom2="ball"/></contact></mujoco>"""
+    with pytest.warns(UserWarning, match="contacts of 'floor', 'ball'"):
+        m.read_mjcf(text)
+
+
+def test_names_that_mujoco_allows_twice():
+    geom = '<geom size=".1" contype="0" conaffinity="0"/>'
+    bodies = "".join(
+        f'<body {name} pos="{k} 0 0"><joint {joint} axis="0 1 0"/>{geom}</body>'
+        for k, (name, joint) in enumerate([('name="body 2"', 'name="x"'), ("", ""), ('name="ground"', 'name="joint 1"')])
+    )
+    equality = '<equality><joint name="x" joint1="x" joint2="joint 1"/></equality>'
+    mechanism = m.read_mjcf(f"<mujoco><worldbody>{bodies}</worldbody>{equality}</mujoco>")
+    assert [body.name for body in mechanism.bodies] == ["body 2", "body body 2", "body ground"]
+    assert [joint.name for joint in mechanism.joints] == ["x", "joint joint 1", "joint 1", "equality x"]

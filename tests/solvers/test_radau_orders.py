@@ -1,4 +1,4 @@
-"""RadauIIA9 and RadauIIA13: what more stages change. What they share with RadauIIA5 is tested there."""
+"""RadauIIA9, RadauIIA13 and Radau, which chooses: what more stages change. What they share with RadauIIA5 is tested there."""
 
 import diffrax
 import jax
@@ -10,7 +10,7 @@ import dae_jax
 from dae_jax.scenes import SCENES
 
 
-NINE, THIRTEEN = dae_jax.RadauIIA9(), dae_jax.RadauIIA13()
+NINE, THIRTEEN, ANY = dae_jax.RadauIIA9(), dae_jax.RadauIIA13(), dae_jax.Radau()
 BOTH = pytest.mark.parametrize("solver", [NINE, THIRTEEN], ids=["9", "13"])
 
 
@@ -63,12 +63,53 @@ def test_algebraic_variables_of_index_two_have_the_order_of_the_stages(solver):
     assert near[0] < 1e-13 + 1e-3 * near[1]
 
 
-def test_fewer_steps_at_tight_tolerances():
+@pytest.mark.parametrize("solver", [THIRTEEN, ANY], ids=["13", "variable"])
+def test_fewer_steps_at_tight_tolerances(solver):
     """RadauIIA5 takes 3875, RadauIIA9 513."""
     scene = SCENES["robertson"]()
-    sol = adaptive(scene.system, THIRTEEN, scene.t1, scene.y0, 1e-10, 1e-10 * scene.scale)
+    sol = adaptive(scene.system, solver, scene.t1, scene.y0, 1e-10, 1e-10 * scene.scale)
     assert sol.stats["num_steps"] < 280
     assert scene.error(np.array([scene.t1]), sol.ys) < 1e-11
+
+
+@pytest.mark.parametrize("rtol", [1e-4, 1e-8])
+@pytest.mark.parametrize("solver", [NINE, THIRTEEN, ANY], ids=["9", "13", "variable"])
+def test_newton_contracts_in_its_own_norm_at_index_two(solver, rtol):
+    """Judged by the algebraic variable, whose corrections are those of the others divided by h, it was given up for ever."""
+    scene = SCENES["hessenberg-2"]()
+    sol = adaptive(scene.system, solver, scene.t1, scene.y0, rtol)
+    assert sol.stats["num_steps"] < 100
+    assert scene.error(np.array([scene.t1]), sol.ys) < 10 * rtol
+
+
+def test_failures_of_newton_are_not_every_other_step():
+    """By 13th order it needs small steps: 749 steps, a third of them in vain, where the step grew back at once."""
+    scene = SCENES["pendulum"]()
+    stats = adaptive(scene.system, THIRTEEN, scene.t1, scene.y0, 1e-8).stats
+    assert stats["num_rejected_steps"] < stats["num_steps"] / 5
+
+
+class TestTheOrderIsChosen:
+    """By the contraction of Newton's method."""
+
+    def test_low_where_it_is_hard_and_high_where_it_is_smooth(self):
+        scene = SCENES["pendulum"]()
+        loose = adaptive(scene.system, ANY, scene.t1, scene.y0, 1e-4, saveat=diffrax.SaveAt(t1=True, solver_state=True))
+        tight = adaptive(scene.system, ANY, scene.t1, scene.y0, 1e-9, saveat=diffrax.SaveAt(t1=True, solver_state=True))
+        assert int(loose.solver_state.which) < 2
+        assert int(tight.solver_state.which) == 2
+
+    def test_errors_follow_the_tolerance(self):
+        scene = SCENES["akzo-nobel"]()
+        for rtol in (1e-4, 1e-7, 1e-10):
+            sol = adaptive(scene.system, ANY, scene.t1, scene.y0, rtol, rtol * scene.scale)
+            assert 1e-4 * rtol < scene.error(np.array([scene.t1]), sol.ys) < 30 * rtol
+
+    def test_it_falls_where_a_source_jumps(self):
+        """ẏ = −1000 (y − s) with a jump of s: steps over it are of the implicit Euler method."""
+        residual = lambda t, y, yd, a: yd + 1000 * (y - jnp.where(t < 0.5, 1.0, 2.0))
+        sol = adaptive(dae_jax.ImplicitDAE(residual), ANY, 1.0, jnp.ones(1), 1e-6)
+        np.testing.assert_allclose(sol.ys[-1], 2.0, rtol=1e-5)
 
 
 def test_the_stabilised_form_keeps_both_levels():
@@ -83,12 +124,13 @@ def test_the_stabilised_form_keeps_both_levels():
     [
         (NINE, lambda t, y, yd, args: [yd[0] + y[0], y[1] - 20 * jnp.cos(20 * t)]),
         (THIRTEEN, lambda t, y, yd, args: [yd[0] - y[1] + 20 * jnp.cos(20 * t), y[0] - jnp.exp(-t)]),
+        (ANY, lambda t, y, yd, args: [yd[0] - y[1] + 20 * jnp.cos(20 * t), y[0] - jnp.exp(-t)]),
     ],
-    ids=["9, index 1", "13, index 2"],
+    ids=["9, index 1", "13, index 2", "variable, index 2"],
 )
 def test_between_steps_errors_follow_the_tolerance(solver, residual):
     times = np.linspace(0, 2, 301)
-    z = 20 * np.cos(20 * times) - (np.exp(-times) if solver is THIRTEEN else 0)
+    z = 20 * np.cos(20 * times) - (np.exp(-times) if solver is not NINE else 0)
     start = jnp.array([1.0, z[0]])
     sol = adaptive(dae_jax.ImplicitDAE(residual), solver, 2.0, start, saveat=diffrax.SaveAt(ts=times))
     np.testing.assert_allclose(sol.ys[:, 0], np.exp(-times), atol=3e-7)
@@ -105,10 +147,11 @@ def reaction(k):
     return system, (jnp.array([1.0, 0.0]), jnp.zeros(1)), jnp.array([0.04, 1e4, 3e7]) * k
 
 
-def test_gradients_and_a_batch():
+@pytest.mark.parametrize("solver", [NINE, ANY], ids=["9", "variable"])
+def test_gradients_and_a_batch(solver):
     def end(k, adjoint):
         system, y0, rates = reaction(k)
-        return adaptive(system, NINE, 40.0, y0, 1e-9, 1e-13, rates, adjoint=adjoint, max_steps=1000).ys[1][-1, 0]
+        return adaptive(system, solver, 40.0, y0, 1e-9, 1e-13, rates, adjoint=adjoint, max_steps=1000).ys[1][-1, 0]
 
     reverse, forward = diffrax.RecursiveCheckpointAdjoint(), diffrax.ForwardMode()
     k, along, h = jnp.array([1.0, 1.1, 0.9]), jnp.array([0.3, -0.5, 1.0]), 1e-4
@@ -119,12 +162,13 @@ def test_gradients_and_a_batch():
     np.testing.assert_allclose(change, (batch[1] - batch[2]) / (2 * h), rtol=1e-5)
 
 
-def test_float32_and_backwards():
+@pytest.mark.parametrize("solver", [THIRTEEN, ANY], ids=["13", "variable"])
+def test_float32_and_backwards(solver):
     """ẏ = z, 0 = z + y: y = e^(1 − t)."""
     system = dae_jax.SemiExplicitDAE(lambda t, x, z, a: z, lambda t, x, z, a: z + x)
     start = (jnp.ones(1, jnp.float32), -jnp.ones(1, jnp.float32))
     sol = dae_jax.daesolve(
-        system, THIRTEEN, 1.0, 0.0, None, start, saveat=diffrax.SaveAt(ts=jnp.array([0.6, 0.0])),
+        system, solver, 1.0, 0.0, None, start, saveat=diffrax.SaveAt(ts=jnp.array([0.6, 0.0])),
         stepsize_controller=diffrax.PIDController(rtol=1e-4, atol=1e-4),
     )  # fmt: skip
     assert sol.ys[0].dtype == jnp.float32
