@@ -19,6 +19,7 @@ from .linalg import fixed_point, implicit_root, relative_change
 from .systems import ConstrainedSystem, System, is_mechanism
 from .types import Args, Phase, State, Time
 from .validate.captured import current
+from .validate.closures import opened
 from .validate.states import broadcast_to_state, refuse_wrong_state, with_rates
 from .validate.user_functions import refuse_wrong_functions
 
@@ -148,7 +149,7 @@ def consistent_state(
     arguments are traced; `NotImplementedError` for its derivative where it has more than 256 unknowns and hidden equations.
     """
     refuse_wrong_state(system, y0)
-    system, args = current((with_rates(system, yd0, y0), args))
+    system, args = opened(current((with_rates(system, yd0, y0), args)))
     y0 = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
     refuse_wrong_functions(system, t0, y0, args)
     masks = jax.tree.map(lambda x: jnp.zeros_like(x, dtype=bool), y0)

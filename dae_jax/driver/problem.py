@@ -14,7 +14,7 @@ from ..compiler.types import Arrays
 from ..equations.constraint_jacobian import Rank
 from ..systems import System
 from ..types import Args, Scalar, State
-from .closures import opened
+from ..validate.closures import opened
 
 
 @functools.partial(
@@ -66,10 +66,7 @@ _ARRAY = object()
 
 def split(tree: PyTree) -> tuple[Program, list[Any]]:
     """What a solve is given, as a program and its arrays."""
-    leaves, treedef = jax.tree.flatten(tree)
-    found = list(map(opened, leaves))
-    if any(x is not y for x, y in zip(found, leaves, strict=True)):
-        leaves, treedef = jax.tree.flatten(jax.tree.unflatten(treedef, found))
+    leaves, treedef = jax.tree.flatten(opened(tree))
     arrays = [x for x in leaves if isinstance(x, jax.Array | np.ndarray | np.generic)]
     static = tuple(_ARRAY if isinstance(x, jax.Array | np.ndarray | np.generic) else x for x in leaves)
     return Program(treedef, static, tuple(map(type, static)), one_kernel_enabled()), arrays

@@ -157,3 +157,30 @@ def test_a_mass_in_a_derivative_that_is_compiled(of):
     np.testing.assert_allclose(of(jax.grad(height))(jnp.array(1.3)), jax.grad(height)(1.3), rtol=1e-12)
     forward = of(lambda m: jax.jvp(height, (m,), (1.0,))[1])
     np.testing.assert_allclose(forward(jnp.array(1.3)), jax.grad(height)(1.3), rtol=1e-9)
+
+
+# Of consistent states
+
+
+def on_a_circle(radius):
+    """The point nearest to (0.8, 0.7) has q₁ = 0.8 r/√1.13."""
+    system = dae_jax.ConstrainedSystem(lambda t, q, v, a: -q, lambda t, q, a: q @ q - radius**2)
+    return dae_jax.consistent_state(system, 0.0, (jnp.array([0.8, 0.7]), jnp.zeros(2)))[0][0]
+
+
+def of_a_circuit(k):
+    system = dae_jax.ImplicitDAE(lambda t, y, yd, a: jnp.stack([yd[0] + y[0], y[1] - k * y[0] ** 2]))
+    return dae_jax.consistent_state(system, 0.0, jnp.array([0.8, 0.7]), fixed=jnp.array([True, False]))[1]
+
+
+@pytest.mark.parametrize(("state", "slope"), [(on_a_circle, 0.8 / np.sqrt(1.13)), (of_a_circuit, 0.64)])
+def test_a_consistent_state_knows_what_its_equations_close_over(state, slope):
+    """Compiled, the derivative was 0; else it was an error."""
+    found = [
+        jax.grad(state)(1.0),
+        jax.jit(jax.grad(state))(1.0),
+        jax.jvp(state, (1.0,), (1.0,))[1],
+        jax.vmap(jax.grad(state))(jnp.ones(2))[1],
+        jax.jit(jax.jacfwd(state))(1.0),
+    ]
+    np.testing.assert_allclose(found, slope, rtol=1e-8)

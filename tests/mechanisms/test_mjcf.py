@@ -147,7 +147,9 @@ def test_constraints_that_are_switched_off_are():
     """Two arms that hold each other, were it not for the flag; and nothing is left out that MuJoCo would have."""
     arm = '<body name="{}" pos="{} 0 0"><joint name="{}" axis="0 1 0" range="-9 9"/><geom size=".1" mass="1" pos=".5 0 0"/></body>'
     arms = arm.format("a", 0, "y") + arm.format("b", 1, "z")
-    text = '<mujoco><option><flag constraint="disable"/></option><worldbody>{}</worldbody><equality>{}</equality></mujoco>'
+    text = (
+        '<mujoco><option><flag constraint="disable"/></option><worldbody>{}</worldbody><equality>{}</equality></mujoco>'
+    )
     mechanism = m.read_mjcf(text.format(arms, '<joint joint1="y" joint2="z" polycoef="0 -1 0 0 0"/>'))
     assert [joint.name for joint in mechanism.joints] == ["y", "z"]
 
@@ -189,7 +191,9 @@ def test_names_that_mujoco_allows_twice():
     geom = '<geom size=".1" contype="0" conaffinity="0"/>'
     bodies = "".join(
         f'<body {name} pos="{k} 0 0"><joint {joint} axis="0 1 0"/>{geom}</body>'
-        for k, (name, joint) in enumerate([('name="body 2"', 'name="x"'), ("", ""), ('name="ground"', 'name="joint 1"')])
+        for k, (name, joint) in enumerate(
+            [('name="body 2"', 'name="x"'), ("", ""), ('name="ground"', 'name="joint 1"')]
+        )
     )
     equality = '<equality><joint name="x" joint1="x" joint2="joint 1"/></equality>'
     mechanism = m.read_mjcf(f"<mujoco><worldbody>{bodies}</worldbody>{equality}</mujoco>")

@@ -13,7 +13,7 @@ A compiled program takes no number that is being differentiated but through its 
 import functools
 import types
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -21,10 +21,20 @@ from jax.core import Tracer
 from jax.tree_util import Partial
 from jaxtyping import PyTree
 
-from ..validate.around import Same, values_of
+from .around import Same, values_of
 
 
-def opened(leaf: Any, within: tuple[Any, ...] = ()) -> Any:
+T = TypeVar("T")
+
+
+def opened(tree: T) -> T:
+    """The tree with each function among its leaves that closes over traced numbers as a pytree that has them as leaves."""
+    leaves, treedef = jax.tree.flatten(tree)
+    found = list(map(_opened, leaves))
+    return tree if all(x is y for x, y in zip(found, leaves, strict=True)) else jax.tree.unflatten(treedef, found)
+
+
+def _opened(leaf: Any, within: tuple[Any, ...] = ()) -> Any:
     """`leaf`, if it is a function that closes over traced numbers, as a pytree that has them as leaves and computes the same.
 
     Looked for in closures and defaults, in `functools.partial` and under `jax.jit`, and in functions that are in these, but not
@@ -36,7 +46,7 @@ def opened(leaf: Any, within: tuple[Any, ...] = ()) -> Any:
 
     def look(tree: PyTree) -> PyTree:
         try:
-            return jax.tree.map(lambda x: opened(x, within), tree)
+            return jax.tree.map(lambda x: _opened(x, within), tree)
         except (TypeError, ValueError):  # a dictionary whose keys have no order
             return Same(tree)
 
@@ -46,7 +56,7 @@ def opened(leaf: Any, within: tuple[Any, ...] = ()) -> Any:
     if not isinstance(leaf, types.FunctionType):
         # `jax.jit` keeps what it compiles; within a program it has nothing to add.
         inner = getattr(leaf, "__wrapped__", None)
-        found = opened(inner, within) if isinstance(inner, types.FunctionType) else inner
+        found = _opened(inner, within) if isinstance(inner, types.FunctionType) else inner
         return leaf if found is inner else found
     try:
         cells = [cell.cell_contents for cell in leaf.__closure__ or ()]
