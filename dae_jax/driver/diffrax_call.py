@@ -25,6 +25,7 @@ from ..solvers import (
     takes_residuals,
 )
 from ..types import Time, Y
+from .bracket import bracketing
 from .crossings import OneCrossing, OnStates
 from .passages import Undetermined, passages, watched
 from .problem import Problem
@@ -88,7 +89,8 @@ def call(solve: "Solve", problem: Problem) -> tuple[Any, ...]:
         }  # fmt: skip
         on_states = lambda c, up: OnStates(c, decode, args, direction, up, given)
         conditions = jax.tree.map(on_states, event.cond_fn, event.direction, is_leaf=lambda x: x is None or callable(x))
-        event = dataclasses.replace(event, cond_fn=conditions)
+        finder = bracketing(event.root_finder) if callable(event.cond_fn) else event.root_finder
+        event = dataclasses.replace(event, cond_fn=conditions, root_finder=finder)
     saveat = dataclasses.replace(saveat, solver_state=True) if counts(solver) else saveat
     sums_errors = isinstance(controller, diffrax.ConstantStepSize) and not solve.recording
     controller = SummedErrors(controller) if sums_errors else controller

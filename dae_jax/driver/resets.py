@@ -9,7 +9,6 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix
 from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
 
@@ -23,6 +22,7 @@ from ..solution import RESULTS, DAESolution, precision_of
 from ..systems import System
 from ..types import Args, Scalar, State, Time, Y
 from ..validate.states import NUMBERS, brief
+from .bracket import Bracket
 from .problem import Problem, Split, count_of, split
 from .start import saved_parts
 
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 # Entries of `stats` that do not add up over the parts of a solve.
 NO_COUNTS = ("max_steps", "end_time")
+# Of a condition's terms, in units of their last digit: what may be round-off of it.
+ROUND_OFF = 1000
 
 
 class Reset(eqx.Module):
@@ -102,7 +104,8 @@ class _FromStart(eqx.Module):
 
 class _Progress(NamedTuple):
     """Where a solve stands: the start of the next part, what was saved so far, `changed` of the args beside, and how the last part
-    ended; `level` is the condition at the start of the last part.
+    ended; `level` is the condition at the start of the last part, `moved` by how much making the state after the last reset consistent
+    has changed it.
     """
 
     t: Float[Array, ""]
@@ -116,6 +119,7 @@ class _Progress(NamedTuple):
     stats: Any
     code: Int[Array, ""]
     level: Float[Array, ""]
+    moved: Float[Array, ""]
 
 
 def solve_with_resets(solve: "Solve", problem: Problem) -> tuple[DAESolution, Any]:
@@ -142,17 +146,18 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Any]:
     sign = jnp.where(t1 < t0, -1, 1).astype(t0.dtype)
     changes = _changes(reset, t0, y0, args)
     numbers, others = eqx.partition(args, _is_number)
-    resolution = float(jnp.finfo(t0.dtype).eps) ** 0.75
+    # In which the order of resets is round-off.
+    together = 16 * float(jnp.finfo(t0.dtype).eps) ** 0.75 * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
     going = int(RESULTS.event_occurred._value)
 
     def part(p: _Progress) -> tuple[DAESolution, Any]:
         args = eqx.combine(p.args, others)
-        level = _level_at_start(system, reset.condition, sign, p.t, p.y, args, p.level, rank)
+        level = _level_at_start(system, reset.condition, sign, p.t, p.y, args, p.level, rank, together, p.moved)
         # A downcrossing, as bisection has to know which way it goes.
         up = {True: -1, False: 1, None: jnp.sign(level)}[reset.direction]
         event = diffrax.Event(
             _FromStart(reset.condition, jnp.asarray(up, t0.dtype), p.t, level),
-            optimistix.Bisection(resolution, resolution, flip=True),
+            Bracket(0.0, 0.0, flip=True),
             direction=False,
         )
         later = sign * jnp.maximum(sign * wanted, sign * p.t)
@@ -172,21 +177,24 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Any]:
         stats = {k: p.stats[k] + v for k, v in sol.stats.items() if k not in NO_COUNTS}
         stats["doubts"] = p.stats["doubts"] | sol.stats["doubts"]
         code = sol.result._value
-        # Jumps so close that their order is round-off are no events any more.
-        piled = (p.count > 0) & (sign * (end - p.t) <= 16 * resolution * (1 + jnp.abs(end)))
+        piled = (p.count > 0) & (sign * (end - p.t) <= together)
         jumps, exhausted = code == going, piled | (p.count >= reset.max_resets)
-        y, after = lax.cond(
+        y, after, moved = lax.cond(
             jumps & ~exhausted,
             lambda: _after(system, reset, end, reached, eqx.combine(p.args, others)),
-            lambda: (jax.tree.map(jnp.asarray, reached), p.args),
+            lambda: (jax.tree.map(jnp.asarray, reached), p.args, jnp.zeros_like(p.moved)),
         )
         times = jnp.where((jnp.arange(reset.max_resets) == p.count) & jumps & ~exhausted, end, p.times)
         code = jnp.where(jumps & exhausted, RESULTS.too_many_jumps._value, code)
-        return _Progress(end, y, after, p.count + (jumps & ~exhausted), times, ts, ys, changed, stats, code, level)
+        return _Progress(
+            end, y, after, p.count + (jumps & ~exhausted), times, ts, ys, changed, stats, code, level, moved
+        )
 
     unknown = jnp.zeros_like(t0)
     none: Any = None
-    shape = jax.eval_shape(part, _Progress(t0, y0, numbers, none, none, none, none, none, none, none, unknown))[0]
+    shape = jax.eval_shape(
+        part, _Progress(t0, y0, numbers, none, none, none, none, none, none, none, unknown, unknown)
+    )[0]
     unsaved = jax.tree.map(lambda x: jnp.full(x.shape, jnp.inf, x.dtype), shape.ys["wanted"])
     stats = {k: jnp.zeros((), int) for k in shape.stats if k not in NO_COUNTS}
     over_times = lambda x: jnp.broadcast_to(x, (*wanted.shape, *jnp.shape(x)))
@@ -194,6 +202,7 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Any]:
     start = _Progress(
         t0, y0, numbers, jnp.zeros((), int), jnp.full(reset.max_resets, jnp.inf, t0.dtype),
         jnp.full_like(wanted, jnp.inf), unsaved, given, stats, jnp.asarray(going, RESULTS.successful._value.dtype), unknown,
+        unknown,
     )  # fmt: skip
     kind: Any = "checkpointed" if solve.derivative() == "reverse" else "lax"
     max_steps = reset.max_resets + 1 if kind == "checkpointed" else None
@@ -231,13 +240,14 @@ def _changes(reset: Reset, t: Time, y: State, args: Args) -> PyTree[bool]:
     return found[0]
 
 
-def _after(system: System, reset: Reset, t: Time, y: State, args: Args) -> tuple[Any, Any]:
-    """The state and the numbers in the args after a reset."""
-    y, new = reset.reset(t, y, args)
-    y = consistent_state(system, t, y, new, fixed=reset.fixed)
-    return y, jax.tree.map(
-        lambda x, like: jnp.asarray(x, jnp.result_type(like)), *(eqx.filter(a, _is_number) for a in (new, args))
-    )
+def _after(system: System, reset: Reset, t: Time, y: State, args: Args) -> tuple[Any, Any, Scalar]:
+    """The state and the numbers in the args after a reset, and by how much the condition has moved with the state that is consistent."""
+    wanted, new = reset.reset(t, y, args)
+    y = consistent_state(system, t, wanted, new, fixed=reset.fixed)
+    moved = jnp.abs(reset.condition(t, y, new) - reset.condition(t, wanted, new))
+    numbers = (eqx.filter(a, _is_number) for a in (new, args))
+    after = jax.tree.map(lambda x, like: jnp.asarray(x, jnp.result_type(like)), *numbers)
+    return y, after, lax.stop_gradient(jnp.asarray(moved, jnp.result_type(t)))
 
 
 def _level_at_start(
@@ -249,9 +259,12 @@ def _level_at_start(
     args: Args,
     before: Scalar,
     rank: int | Rank | None,
+    together: Scalar,
+    moved: Scalar,
 ) -> Any:
     """The condition at the start of a part; where this is zero, the sign with which it leaves zero, forwards or, with `sign` −1,
-    backwards. That is the sign with which it came, −`before`, where its rate is not known.
+    backwards. That is the sign with which it came, −`before`, where its rate is not known. Zero is what the condition moves by
+    while times are `together`, what may be round-off of the state in it, and what it has `moved` by.
     """
     value = jnp.asarray(condition(t, y, args))
     # The state as it is: one made anew from the underlying ODE is NaN where the structure allows what the numbers do not.
@@ -259,6 +272,9 @@ def _level_at_start(
     of = lambda t, z: jnp.asarray(condition(t, ode.decode(t, z), args), t.dtype)
     _, rate = jax.jvp(of, (t, z), (jnp.ones_like(t), ode.field(t, z)))
     rate = jnp.where(jnp.isfinite(rate), sign * rate, -before)
-    zero = float(jnp.finfo(t.dtype).eps) ** 0.5 * (1 + jnp.abs(rate))
+    slopes = jax.tree.leaves(jax.grad(of, 1)(t, z))
+    terms = sum(jnp.sum(jnp.abs(slope * x)) for slope, x in zip(slopes, jax.tree.leaves(z), strict=True))
+    zero = jnp.abs(rate) * together + ROUND_OFF * jnp.finfo(t.dtype).eps * jnp.where(jnp.isfinite(terms), terms, 0)
+    zero = zero + 2 * moved
     leaves = (jnp.abs(value) <= zero) & (rate != 0)
     return lax.stop_gradient(jnp.where(leaves, jnp.where(rate > 0, zero, -zero), value))
