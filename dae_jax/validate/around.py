@@ -2,13 +2,18 @@
 functions by their code, classes, attributes.
 """
 
+import contextvars
+import ctypes
 import functools
 import hashlib
 import itertools
 import marshal
+import mmap
+import re
 import sys
 import sysconfig
 import types
+import weakref
 from array import array
 from collections import deque
 from collections.abc import Callable, Hashable, Iterable, Iterator
@@ -29,6 +34,10 @@ MOST = 2000
 _CONTAINERS = frozenset({list, tuple, dict, set, frozenset, deque, array})
 # Of any size these are known by what is in them, where that is of these types.
 _PLAIN = frozenset({list, tuple, dict})
+# Known by their bytes.
+_BUFFERS = (bytearray, memoryview, mmap.mmap, ctypes.Array, ctypes.Structure, ctypes.Union, ctypes._SimpleCData)
+# Functions by which others are found whose names are in a text.
+_BY_NAME = frozenset({"eval", "exec", "globals", "locals", "vars"})
 _PRIMITIVE = frozenset({type(None), bool, int, float, complex, str, bytes})
 # What Python keeps with every class, and what changes without meaning.
 _OF_EVERY_CLASS = frozenset(
@@ -137,6 +146,8 @@ class Look:
             return type(x), x
         if isinstance(x, float):
             return float, x.hex()
+        if isinstance(x, np.ma.MaskedArray):
+            return np.ma.MaskedArray, self.value(x.data), self.value(np.ma.getmaskarray(x))
         if isinstance(x, np.ndarray | np.generic):
             x = np.asarray(x)
             return _of_numbers(x) if x.dtype != object else (x.shape, self.value(tuple(x.ravel())))
@@ -174,6 +185,12 @@ class Look:
     def _of_parts(self, x: Any) -> Hashable:
         if isinstance(x, types.FunctionType | types.MethodType | functools.partial):
             return code_of(x), self.of_callable(x)
+        if isinstance(x, _BUFFERS):
+            return Same(x), hashlib.blake2b(memoryview(x).tobytes()).digest()
+        if isinstance(x, contextvars.ContextVar):
+            return Same(x), self._counted(x.get(None))
+        if isinstance(x, weakref.ref):
+            return Same(x), self._counted(x())
         if isinstance(x, property):
             return tuple(map(self._counted, (x.fget, x.fset)))
         if isinstance(x, staticmethod | classmethod):
@@ -196,7 +213,8 @@ class Look:
 
     def _of_class(self, x: type) -> Hashable:
         own = ((name, y) for name, y in vars(x).items() if name not in _OF_EVERY_CLASS)
-        return Same(x), *((name, self._counted(y)) for name, y in own), *map(self._counted, x.__bases__)
+        above = (*x.__bases__, type(x))
+        return Same(x), *((name, self._counted(y)) for name, y in own), *map(self._counted, above)
 
     def _counted(self, x: object) -> Hashable:
         self.count += 1
@@ -243,4 +261,6 @@ def _of_numbers(x: np.ndarray) -> Hashable:
 def _names(code: types.CodeType) -> tuple[str, ...]:
     """The names that a function, and those that are written in it, may look up."""
     within = (name for x in code.co_consts if isinstance(x, types.CodeType) for name in _names(x))
-    return tuple(dict.fromkeys((*code.co_names, *within)))
+    texts = (x for x in code.co_consts if isinstance(x, str)) if _BY_NAME.intersection(code.co_names) else ()
+    in_texts = (name for text in texts for name in re.findall(r"[^\W\d]\w*", text))
+    return tuple(dict.fromkeys((*code.co_names, *within, *in_texts)))

@@ -4,9 +4,12 @@ function that was written anew gives.
 
 import array
 import collections
+import contextvars
+import ctypes
 import functools
 import sys
 import types
+import weakref
 
 import diffrax
 import equinox as eqx
@@ -96,6 +99,29 @@ def set_of_one(x):
     SET.add(x)
 
 
+VARIABLE = contextvars.ContextVar("k", default=9.81)
+BYTES, CELLS, VIEWED = bytearray([9]), (ctypes.c_double * 1)(9.81), np.array([9.81])
+VIEW, REFERENCE = memoryview(VIEWED), weakref.ref(SPRING)
+MASKED = np.ma.array([9.81, 8.81 - 2 * 8.81], mask=[False, True])
+
+
+class Meta(type):
+    k = 9.81
+
+
+class OfMeta(metaclass=Meta):
+    pass
+
+
+def set_byte(x):
+    BYTES[0] = int(x)
+
+
+def set_mask(x):
+    """The sum is 9.81 or 1."""
+    MASKED.mask = [False, x == 9.81]
+
+
 class Case:
     """A force that takes its value from somewhere, and how that is changed."""
 
@@ -155,6 +181,15 @@ CASES = {
     "a property": lambda: Case(lambda t, q, v, args, of=OF_CLASS: along(of.doubled / 2), lambda x: TABLE.update(k=x)),
     "a global of a method": lambda: Case(lambda t, q, v, args, of=OF_CLASS: along(of.of_global()), set_global),
     "a module that it imports": lambda: Case(importing, lambda x: setattr(SETTINGS, "k", x)),
+    "a context variable": lambda: Case(lambda t, q, v, args: along(VARIABLE.get()), VARIABLE.set),
+    "a global by its name": lambda: Case(lambda t, q, v, args: along(globals()["K"]), set_global),
+    "a global in a text": lambda: Case(lambda t, q, v, args: along(eval("1 * K")), set_global),
+    "bytes": lambda: Case(lambda t, q, v, args: along(BYTES[0] + 0.81 * (BYTES[0] > 1)), set_byte),
+    "a view of memory": lambda: Case(lambda t, q, v, args: along(VIEW[0]), VIEWED.fill),
+    "an array of C": lambda: Case(lambda t, q, v, args: along(CELLS[0]), lambda x: CELLS.__setitem__(0, x)),
+    "a weak reference": lambda: Case(lambda t, q, v, args: along(REFERENCE().k), lambda x: setattr(SPRING, "k", x)),
+    "a metaclass": lambda: Case(lambda t, q, v, args: along(OfMeta.k), lambda x: setattr(Meta, "k", x)),
+    "a mask": lambda: Case(lambda t, q, v, args: along(float(MASKED.sum())), set_mask),
     "a closure": of_a_closure,
     "a partial": of_a_partial,
     "a default": of_a_default,
