@@ -10,6 +10,7 @@ import functools
 import sys
 import types
 import weakref
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -105,6 +106,10 @@ VIEW, REFERENCE = memoryview(VIEWED), weakref.ref(SPRING)
 MASKED = np.ma.array([9.81, 8.81 - 2 * 8.81], mask=[False, True])
 
 
+def spring_behind() -> Any:
+    return REFERENCE()
+
+
 class Meta(type):
     k = 9.81
 
@@ -187,7 +192,7 @@ CASES = {
     "bytes": lambda: Case(lambda t, q, v, args: along(BYTES[0] + 0.81 * (BYTES[0] > 1)), set_byte),
     "a view of memory": lambda: Case(lambda t, q, v, args: along(VIEW[0]), VIEWED.fill),
     "an array of C": lambda: Case(lambda t, q, v, args: along(CELLS[0]), lambda x: CELLS.__setitem__(0, x)),
-    "a weak reference": lambda: Case(lambda t, q, v, args: along(REFERENCE().k), lambda x: setattr(SPRING, "k", x)),
+    "a weak reference": lambda: Case(lambda t, q, v, args: along(spring_behind().k), lambda x: setattr(SPRING, "k", x)),
     "a metaclass": lambda: Case(lambda t, q, v, args: along(OfMeta.k), lambda x: setattr(Meta, "k", x)),
     "a mask": lambda: Case(lambda t, q, v, args: along(float(MASKED.sum())), set_mask),
     "a closure": of_a_closure,
