@@ -6,10 +6,13 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.extend.core
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import PyTree
 
+from ..compiler import equations
 from ..systems import ConstrainedSystem, System, is_mechanism
 from ..types import Args, State, Time
 from .states import NUMBERS, describe
@@ -72,7 +75,8 @@ def returned(call: str, function: Callable[..., Any], *values: State) -> Any:
     """The shapes that `function` returns for these arguments; `call` is how it is to be called, `force(t, q, v, args)`."""
     refuse_other_arguments(call, function, len(values))
     try:
-        return eqx.filter_eval_shape(function, *values)
+        jaxpr, arrays, others = eqx.filter_make_jaxpr(function)(*values)
+        again, *_ = eqx.filter_make_jaxpr(function)(*values)
     except TRACED as error:
         raise ValueError(
             f"`{call}` must be traceable by JAX, but makes numbers of its arguments ({_first_line(error)}): use jax.numpy and "
@@ -82,6 +86,20 @@ def returned(call: str, function: Callable[..., Any], *values: State) -> Any:
         raise ValueError(
             f"`{call}` fails with {', '.join(_named(call, values))}: {type(error).__name__}: {_first_line(error)}."
         ) from error
+    if _numbers_in(jaxpr) != _numbers_in(again):
+        raise ValueError(
+            f"`{call}` has other numbers in it each time it is called, such as random ones or the time of day: the compiled program would "
+            "go on with those of one call. Find them before, and hand them over in `args`."
+        )
+    return eqx.combine(arrays, others)
+
+
+def _numbers_in(jaxpr: jax.extend.core.ClosedJaxpr) -> list[Any]:
+    """What a program knows of numbers, but for what is traced outside."""
+    found = [x.val for eqn in equations(jaxpr) for x in eqn.invars if isinstance(x, jax.extend.core.Literal)]
+    known = (x for x in (*found, *jaxpr.consts) if isinstance(x, NUMBERS) and not isinstance(x, Tracer))
+    # Keys of `jax.random` are of no dtype of numpy, and made of numbers that are there too.
+    return [np.asarray(x).tobytes() for x in known if isinstance(getattr(x, "dtype", np.dtype(float)), np.dtype)]
 
 
 def refuse_other_arguments(call: str, function: Callable[..., Any], count: int, **keywords: object) -> None:

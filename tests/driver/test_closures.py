@@ -184,3 +184,13 @@ def test_a_consistent_state_knows_what_its_equations_close_over(state, slope):
         jax.jit(jax.jacfwd(state))(1.0),
     ]
     np.testing.assert_allclose(found, slope, rtol=1e-8)
+
+
+@pytest.mark.parametrize("place", ["closure", "args"])
+def test_a_key_of_the_new_kind(place):
+    """ẏ = −k y with a k that is drawn."""
+    key = jax.random.key(3)
+    draw = lambda args: jax.random.uniform(key if place == "closure" else args)
+    system = dae_jax.ImplicitDAE(lambda t, y, yd, args: jnp.stack([yd[0] + draw(args) * y[0], y[1] - y[0]]))
+    sol = dae_jax.daesolve(system, dae_jax.BDF(), 0.0, 1.0, None, jnp.ones(2), None if place == "closure" else key)
+    np.testing.assert_allclose(sol.ys[0], np.exp(-jax.random.uniform(key)), rtol=1e-5)

@@ -4,6 +4,7 @@
 
 import math
 import re
+import time
 
 import diffrax
 import jax
@@ -15,6 +16,7 @@ import dae_jax as D
 
 
 TSIT5, RADAU, PROJECTED = diffrax.Tsit5(), D.RadauIIA5(), D.OrthogonalProjection(diffrax.Tsit5())
+RANDOM = np.random.default_rng(0)
 Q0, V0 = jnp.array([1.0, 0.0]), jnp.zeros(2)
 
 
@@ -87,6 +89,9 @@ FUNCTIONS = {
     "force without args": (mechanism(lambda t, q, v: q), "`force(t, q, v, args)` must take these arguments, but the function given takes (t, q, v): write `def force(t, q, v, args): ...`."),
     "force by math": (mechanism(lambda t, q, v, a: math.sin(q[0]) * q), "use jax.numpy and `jnp.where` in place of numpy, `math`, `float` and `if`."),
     "force with an if": (mechanism(lambda t, q, v, a: q if q[0] > 0 else -q), "`force(t, q, v, args)` must be traceable by JAX"),
+    "force by chance": (mechanism(lambda t, q, v, a: q * np.random.rand()), "`force(t, q, v, args)` has other numbers in it each time it is called, such as random ones or the time of day"),
+    "force by a generator": (mechanism(lambda t, q, v, a: q + RANDOM.normal(size=2)), "Find them before, and hand them over in `args`."),
+    "force by the clock": (mechanism(lambda t, q, v, a: q * time.perf_counter()), "the compiled program would go on with those of one call"),
     "force and constraint swapped": (mechanism(lambda t, q, a: q @ q, lambda t, q, v, a: q), "`force(t, q, v, args)` must take these arguments, but the function given takes (t, q, a)"),
     "force is no function": (mechanism("gravity"), "`force` must be a function, but is 'gravity'."),
     "args in words": (lambda: solve(D.ConstrainedSystem(lambda t, q, v, a: a * q, constraint), args="9.81"), "`force(t, q, v, args)` fails with q: float64[2], v: float64[2], args: '9.81': TypeError"),

@@ -16,6 +16,7 @@ from jax.extend.core import ClosedJaxpr, Literal
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
+from .._compat import is_key
 from ..types import Atom, Equation, aval_of
 from .movement import MOVEMENTS, dynamic_slice, gather, scatter
 from .numbers import converted, on_numbers
@@ -101,6 +102,8 @@ class ScalarInterpreter(Generic[E]):
         """A constant as known numbers, or as unknown ones where it is being traced."""
         if isinstance(x, Tracer):
             return self.traced(x)
+        if is_key(x):
+            raise Unsupported("keys are no entries")
         x = np.asarray(x)
         return objects([x[i] for i in np.ndindex(x.shape)], x.shape)
 
