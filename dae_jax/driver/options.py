@@ -100,8 +100,8 @@ def refuse_misfits(formulation: AbstractFormulation, solver: diffrax.AbstractSol
         )
     if is_residual and not residuals:
         raise ValueError(
-            f"{name} needs an ODE, and {type(formulation).__name__} (GGL() is one) is none: solve it with RadauIIA5() or BDF(), or use "
-            f"{name} with Differentiation()."
+            f"{name} needs an ODE, and a residual 0 = F(t, y, ẏ), as GGL() and Residual(...) make it, is none: solve it with "
+            f"RadauIIA5() or BDF(), or use {name} with Differentiation()."
         )
     if selects and not (residuals or is_explicit(solver)):
         raise ValueError(

@@ -29,6 +29,7 @@ from ..solution import RESULTS
 from ..types import State
 from ..validate.captured import current
 from ..validate.states import brief
+from ..validate.user_functions import TRACED
 from .progress import Progress
 from .sweep_store import Memory, Store
 
@@ -124,7 +125,13 @@ def sweep(
         raise ValueError(f"`chunk_size` must be at least 1, but is {chunk_size}.")
     lanes = min(lanes, -(-size // len(devices)))
     chunk = lanes * len(devices)
-    call, out = _compiled(fn, elements, chunk, devices)
+    try:
+        call, out = _compiled(fn, elements, chunk, devices)
+    except TRACED as error:
+        raise ValueError(
+            f"`fn` must be traceable by JAX, but makes numbers of what it is given ({str(error).splitlines()[0].rstrip('.')}): use "
+            "jax.numpy and `jnp.where` in place of numpy, `math`, `float` and `if`, and return arrays."
+        ) from error
     leaves, structure = jax.tree.flatten(out)
     leaves = [jax.ShapeDtypeStruct((size, *x.shape[1:]), x.dtype) for x in leaves]
     chunks = -(-size // chunk)

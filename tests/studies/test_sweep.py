@@ -263,3 +263,8 @@ def test_lyapunov_exponent_is_the_growth_of_a_small_difference_in_minimal_coordi
         stepsize_controller=controller,
     )
     np.testing.assert_allclose(exponent, np.log(norm(grown) / norm(start)) / t1, rtol=1e-4)
+
+
+def test_what_is_not_traceable_is_refused_in_a_sentence():
+    with pytest.raises(ValueError, match="`fn` must be traceable by JAX, but makes numbers of what it is given"):
+        dae_jax.sweep(lambda angle: float(angle), np.linspace(0, 1, 3), progress=False)
