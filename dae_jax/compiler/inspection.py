@@ -65,7 +65,7 @@ class Lowered:
         return found["s"]
 
     def __repr__(self) -> str:
-        count = sum(1 for _ in equations(self.kernel))
+        count = len(equations(self.kernel))
         batch = ", a batch as lanes of vectors" if any(self.lanes) else ""
         lines = [f"{_WORDS[self.compiler]}{batch}: {count} equations"]
         lines += [f"  not taken by our compiler: {reason}" for reason in self.unsupported]

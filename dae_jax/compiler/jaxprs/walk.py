@@ -1,6 +1,7 @@
 """What is in a jaxpr."""
 
 import enum
+import weakref
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from typing import Any, TypeVar
 
@@ -37,19 +38,30 @@ _PLAIN = frozenset({int, bool, float, str, type(None)})
 _PLAIN_KINDS = int | float | str | np.dtype | np.generic | enum.Enum | None
 
 
-def equations(jaxpr: ClosedJaxpr | Jaxpr) -> Iterator[Any]:
+# They are asked for at each level, of programs that do not change.
+_known: weakref.WeakKeyDictionary[Jaxpr, tuple[Any, ...]] = weakref.WeakKeyDictionary()
+
+
+def equations(jaxpr: ClosedJaxpr | Jaxpr) -> tuple[Any, ...]:
     """The equations of a jaxpr, at any depth."""
-    for eqn in (jaxpr.jaxpr if isinstance(jaxpr, ClosedJaxpr) else jaxpr).eqns:
-        yield eqn
-        yield from equations_in(eqn)
+    inner: Any = jaxpr.jaxpr if isinstance(jaxpr, ClosedJaxpr) else jaxpr
+    if inner not in _known:
+        every: list[Any] = []
+        for eqn in inner.eqns:
+            every.append(eqn)
+            every += equations_in(eqn)
+        _known[inner] = tuple(every)
+    return _known[inner]
 
 
-def equations_in(eqn: Equation) -> Iterator[Any]:
+def equations_in(eqn: Equation) -> list[Any]:
     """The equations of all jaxprs that an equation holds."""
+    found: list[Any] = []
     for param in eqn.params.values():
         if type(param) not in _PLAIN:
             for jaxpr in jaxprs_in(param):
-                yield from equations(jaxpr)
+                found += equations(jaxpr)
+    return found
 
 
 def jaxprs_in(param: object) -> Iterator[ClosedJaxpr | Jaxpr]:

@@ -121,7 +121,7 @@ class _Estimate:
 def is_written_out(eqn: Equation) -> bool:
     """Whether the turns of a `scan` stand one after another."""
     p, of_ys = eqn.params, [v.aval for v in eqn.outvars[scan_counts(eqn.params)[1] :]]
-    total = p["length"] * (1 + sum(1 for _ in equations(p["jaxpr"])))
+    total = p["length"] * (1 + len(equations(p["jaxpr"])))
     few = total <= THRESHOLDS.written_out and all(y.size <= THRESHOLDS.in_registers for y in of_ys)
     return few or p["length"] <= 1
 

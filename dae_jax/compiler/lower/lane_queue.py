@@ -32,8 +32,8 @@ class NotQueued(Exception):
 
 def main_loop(jaxpr: ClosedJaxpr) -> int | None:
     """Where in a jaxpr without calls the loop is that does most of the work; `None` where none does more than half."""
-    total = sum(1 for _ in equations(jaxpr))
-    sizes = [sum(1 for _ in equations_in(eqn)) for eqn in jaxpr.jaxpr.eqns]
+    total = len(equations(jaxpr))
+    sizes = [len(equations_in(eqn)) for eqn in jaxpr.jaxpr.eqns]
     place = int(np.argmax([0, *sizes])) - 1
     is_loop = place >= 0 and jaxpr.jaxpr.eqns[place].primitive.name == "while"
     return place if is_loop and sizes[place] > total / 2 else None
