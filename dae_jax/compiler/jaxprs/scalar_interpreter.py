@@ -98,7 +98,7 @@ class ScalarInterpreter(Generic[E]):
                 raise Unsupported("too many operations")
         return [read(v) for v in jaxpr.outvars]
 
-    def constant(self, x: ArrayLike) -> np.ndarray:
+    def constant(self, x: Any) -> np.ndarray:
         """A constant as known numbers, or as unknown ones where it is being traced."""
         if isinstance(x, Tracer):
             return self.traced(x)
