@@ -152,14 +152,14 @@ class TestRadau:
     def test_stages_are_predicted_on_the_last_polynomial(self, method):
         """A cubic goes on as it is in a step of another size."""
         cubic, h, new = np.polynomial.Polynomial([0.0, 1.0, -0.4, 0.3]), 0.5, 0.2
-        last = radau._State(jnp.asarray(cubic(h * method.nodes)[:, None]), jnp.asarray(h), *[None] * 7)
+        last = radau.RadauState(jnp.asarray(cubic(h * method.nodes)[:, None]), jnp.asarray(h), *[None] * 7)
         expected = cubic(h + new * method.nodes) - cubic(h)
         np.testing.assert_allclose(radau._predicted(last, new)[:, 0], expected, rtol=1e-11, atol=1e-11)
 
     def test_a_polynomial_of_high_degree_is_not_continued_far(self, method):
         """By three stages into any step that diffrax makes next; by more where noise stays noise."""
         noise = np.where(np.arange(method.stages) % 2, 1e-12, -1e-12)[:, None]
-        last = radau._State(jnp.asarray(noise), jnp.asarray(1.0), *[None] * 7)
+        last = radau.RadauState(jnp.asarray(noise), jnp.asarray(1.0), *[None] * 7)
         ahead = [np.abs(radau._predicted(last, jnp.asarray(ratio))).max() for ratio in (0.5, 1.2, 10.0)]
         assert max(ahead) < 1e-6
         assert (np.array(ahead) > 0).tolist() == [True, True, method.stages == 3]
@@ -169,7 +169,7 @@ class TestRadau:
         s, h, before = method.stages, 0.5, 0.8
         power = lambda x: (x + before) ** (s + 1) - before ** (s + 1)
         last = np.polynomial.Polynomial([*[0.0] * (s + 1), 1.0])(before * method.nodes)
-        state = radau._State(jnp.asarray(last[:, None]), jnp.asarray(before), *[None] * 7)
+        state = radau.RadauState(jnp.asarray(last[:, None]), jnp.asarray(before), *[None] * 7)
         found = radau._between(method, state, jnp.asarray(h), jnp.asarray(power(h * method.nodes)[:, None]))
         np.testing.assert_allclose(np.abs(found), method.between * h ** (s + 1), rtol=1e-8)
 
