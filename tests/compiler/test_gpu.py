@@ -1,6 +1,5 @@
 """Kernels for GPUs without a GPU: the program of a thread is run here, PTX is taken by NVIDIA's assembler, launches are looked at."""
 
-import contextlib
 import ctypes
 import dataclasses
 import os
@@ -29,8 +28,9 @@ PARTS = 4
 HERE = dataclasses.replace(target.host(), width=1, threads=True)
 FOLDERS = list(ptx._folders())
 PTXAS = next((str(f) for folder in FOLDERS for f in folder.glob("bin/ptxas")), shutil.which("ptxas"))
+HAS_CUDA = PTXAS is not None and ptx.libdevice() is not None
 NEEDS_CUDA = pytest.mark.skipif(
-    PTXAS is None or ptx.libdevice() is None,
+    not HAS_CUDA,
     reason="NVIDIA's assembler and libdevice are in the package nvidia-cuda-nvcc",
 )
 
@@ -45,15 +45,6 @@ def on_threads(jaxpr, lanes):
         return jax.ffi.ffi_call(name, structs)(*xs)
 
     return jax.jit(call)
-
-
-@contextlib.contextmanager
-def kernels_seen(monkeypatch):
-    """The kernels that are compiled meanwhile, with their lanes."""
-    found, before = [], kernel_call._by_llvm
-    with monkeypatch.context() as patch:
-        patch.setattr(kernel_call, "_by_llvm", lambda *args: (found.append(args[:3]), before(*args))[1])
-        yield found
 
 
 def solve(method, t1=0.3):
@@ -81,14 +72,17 @@ def derived(method, gradient):
     return jax.grad(loss, argnums=(0, 1)) if gradient else solve(method)
 
 
-def of_method(method, gradient, monkeypatch):
-    fn = derived(method, gradient)
-    # What other tests have compiled is compiled again.
-    salt = np.random.default_rng(hash(method.name) % 2**32).uniform(size=3)
-    with kernels_seen(monkeypatch) as found:
-        jax.jit(lambda q, v: (jax.vmap(fn)(q, v), salt)).lower(*starts())
-    assert found
-    return [(jaxpr, tuple(lanes)) for jaxpr, lanes, _ in found if any(lanes)]
+def assembled(jaxpr, lanes, folder):
+    """What NVIDIA's assembler says of a kernel's registers, for each of two generations of GPUs."""
+    said = []
+    for capability in (80, 90):
+        to, file = ptx.target(capability), folder / "k.ptx"
+        file.write_text(ptx.ptx(lower.written(jaxpr, lanes, target=to).replace("{name}", "k"), to))
+        command = [PTXAS, "-v", f"-arch={to.cpu}", file, "-o", folder / "k.cubin"]
+        ran = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert ran.returncode == 0, ran.stderr
+        said += [line.partition(":")[2].strip() for line in ran.stderr.splitlines() if "Used" in line][-1:]
+    return said
 
 
 OWN = [method for method in METHODS if not method.twin]
@@ -96,43 +90,27 @@ OWN = [method for method in METHODS if not method.twin]
 
 @pytest.mark.parametrize("gradient", [False, True], ids=["solve", "gradient"])
 @pytest.mark.parametrize("method", OWN, ids=lambda m: m.name)
-class TestMethods:
-    """Every method, its solve and its gradient."""
+def test_a_method_as_threads(method, gradient, monkeypatch, tmp_path, capsys):
+    """Every method, its solve and its gradient: threads give what the lanes of vectors give, and NVIDIA's assembler takes their program."""
+    fn, seen = derived(method, gradient), []
 
-    def test_the_program_of_a_thread(self, method, gradient, monkeypatch):
-        """It gives what the lanes of vectors give."""
-        fn, seen = derived(method, gradient), []
+    def compiled(jaxpr, lanes, target=None):
+        if not any(lanes):
+            return before(jaxpr, lanes)
+        seen.append((jaxpr, tuple(lanes)))
+        return on_threads(jaxpr, lanes)
 
-        def compiled(jaxpr, lanes, target=None):
-            seen.append(any(lanes))
-            return on_threads(jaxpr, lanes) if any(lanes) else before(jaxpr, lanes)
-
-        wanted, before = jax.jit(jax.vmap(fn))(*starts(7)), kernel_call.lower.compiled
-        monkeypatch.setattr(kernel_call.lower, "compiled", compiled)
-        found = jax.jit(jax.vmap(lambda q, v: fn(q, v)))(*starts(7))
-        assert any(seen)
-        for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
-            assert np.isfinite(b).all()
-            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
-
-    @NEEDS_CUDA
-    def test_nvidias_assembler_takes_it(self, method, gradient, monkeypatch, tmp_path, capsys):
-        for k, (jaxpr, lanes) in enumerate(of_method(method, gradient, monkeypatch)):
-            for capability in (80, 90):
-                to = ptx.target(capability)
-                text = lower.written(jaxpr, lanes, target=to).replace("{name}", "k")
-                file = tmp_path / f"{k}.ptx"
-                file.write_text(ptx.ptx(text, to))
-                said = subprocess.run(
-                    [PTXAS, "-v", f"-arch={to.cpu}", file, "-o", tmp_path / "k.cubin"],
-                    capture_output=True,
-                    text=True,
-                    check=False,
-                )
-                assert said.returncode == 0, said.stderr
-                used = [line.partition(":")[2].strip() for line in said.stderr.splitlines() if "Used" in line]
-                with capsys.disabled():
-                    print(f"\n{method.name}, {'gradient' if gradient else 'solve'}, {to.cpu}: {used[-1]}", end="")
+    wanted, before = jax.jit(jax.vmap(fn))(*starts(7)), kernel_call.lower.compiled
+    monkeypatch.setattr(kernel_call.lower, "compiled", compiled)
+    found = jax.jit(jax.vmap(lambda q, v: fn(q, v)))(*starts(7))
+    assert seen
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        assert np.isfinite(b).all()
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+    for kernel in seen if HAS_CUDA else ():
+        said = assembled(*kernel, tmp_path)
+        with capsys.disabled():
+            print(f"\n{method.name}, {'gradient' if gradient else 'solve'}: {'; '.join(said)}", end="")
 
 
 @pytest.mark.parametrize("part", range(PARTS))

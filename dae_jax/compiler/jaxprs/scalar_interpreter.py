@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Literal
-from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from .._compat import is_key
