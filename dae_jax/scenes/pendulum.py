@@ -10,7 +10,7 @@ from .scene import Drawing, Scene, State, minimal
 def pendulum(
     angle: float = np.pi / 2, angular_velocity: float = 0.0, gravity: float = 9.81
 ) -> Scene[ConstrainedSystem]:
-    """The pendulum of Pöll, Hafner and Heinzl: v̇ = (0, g) − λ q, 0 = (|q|² − 1)/2, two degrees of freedom in (q, v).
+    """The pendulum of Pöll, Hafner and Heinzl: v̇ = (0, g) − λ q, 0 = (|q|² − 1)/2, one degree of freedom.
 
     `angle` from the downward vertical in rad; the default is released horizontally. The reference is exact, by Jacobi
     elliptic functions, also for a pendulum that swings over the top.
