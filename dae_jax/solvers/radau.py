@@ -52,9 +52,10 @@ GROWTH = 10
 # Where a factorisation takes as long as many steps, a step that could grow by no more than this keeps its size (the program
 # RADAU5).
 WORTHWHILE = 1.2
-# The rate θ of Newton's method that a step may be expected to have, and the power of h that θ grows with, seen where many stages take
-# the Jacobian of one.
-CONTRACTS, STEEP = 0.2, 3
+# A step in which Newton's method contracts by less than FAST may grow by no more than CAREFUL, and not at all where by less than SLOW: with
+# many stages, which take the Jacobian of one, θ grows like h³, and every other step would fail. In few levels, as θ is often the
+# quotient of what is round-off.
+SLOW, CAREFUL = 0.1, 1.5
 
 
 class RadauState(NamedTuple):
@@ -150,7 +151,7 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
         # What is algebraic may jump in the smallest step.
         bend = constant((rates - state.rates) * (step.h / 2)) * args.structure.differential
         scaled = jnp.where(smallest, bend, counted)
-        error = tol.norm(scaled, y0, y1)
+        error = constant(tol.norm(scaled, y0, y1))
         failure = of_step(newton.converged, factors.probe.determined, error)
         scaled = scaled * self._held(args, error, newton)
         y1, scaled, result = at_min_step(failure, t0, t1, y0, y1, scaled)
@@ -166,8 +167,8 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
         """
         order = self.stages + 1
         size = lambda growth: (SAFETY / growth) ** order
-        growth = jnp.where(newton.count > 1, (CONTRACTS / newton.theta) ** (1 / STEEP), GROWTH)
-        least = size(jnp.clip(growth, 1, GROWTH))
+        theta = jnp.where(newton.count > 1, newton.theta, 0)
+        least = jnp.where(theta > SLOW, size(1), jnp.where(theta > FAST, size(CAREFUL), 0))
         held = jnp.where((error > 0) & (error < least), least / error, 1)
         if not linearised.storage.dear:
             return held

