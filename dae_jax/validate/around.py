@@ -188,7 +188,7 @@ class Look:
         if isinstance(x, _BUFFERS):
             return Same(x), hashlib.blake2b(memoryview(x).tobytes()).digest()
         if isinstance(x, contextvars.ContextVar):
-            return Same(x), self._counted(x.get(None))
+            return Same(x), self._counted(_of_variable(x))
         if isinstance(x, weakref.ref):
             return Same(x), self._counted(x())
         if isinstance(x, property):
@@ -228,6 +228,13 @@ def _attributes(x: object) -> dict[str, Any]:
     slots = [name for of in type(x).__mro__ for name in _tuple(vars(of).get("__slots__", ()))]
     found = {name: getattr(x, name) for name in slots if name not in _OF_EVERY_CLASS and hasattr(x, name)}
     return found | getattr(x, "__dict__", {})
+
+
+def _of_variable(x: contextvars.ContextVar[Any]) -> Any:
+    try:
+        return x.get()
+    except LookupError:  # it has no value yet
+        return None
 
 
 def _entries(x: Any) -> Iterable[object]:

@@ -145,5 +145,6 @@ class TestObjectCodeOnDisk:
             os.utime(cache / f"key{k}.o", (k, k))
         assert sorted(f.name for f in cache.iterdir()) == ["key3.o", "key4.o"]
 
-    def test_no_cache_no_file(self, tmp_path):
+    def test_no_cache_no_file(self, monkeypatch):
+        monkeypatch.setitem(jax.config.values, "jax_compilation_cache_dir", None)
         assert object_cache._folder() is None

@@ -266,13 +266,14 @@ class TestCounters:
 
     @pytest.fixture(params=["list", "dictionary", "nonlocal"])
     def counted(self, request):
-        count, calls, table = 0, [], {"calls": 0}
+        # pytest's request leads to all there is.
+        count, calls, table, kind = 0, [], {"calls": 0}, request.param
 
         def force(t, q, v, args):
             nonlocal count
-            if request.param == "list":
+            if kind == "list":
                 calls.append(1)
-            elif request.param == "dictionary":
+            elif kind == "dictionary":
                 table["calls"] += 1
             else:
                 count += 1
