@@ -62,8 +62,9 @@ class Radau(Replayable, AbstractResidualSolver):
 
     **Arguments**
 
-    - `dense`, `rtol`, `atol`: as for `RadauIIA5`. A step-size controller must have its default coefficients: the error that it
-      is given is one from which it finds the size for the order of the step.
+    - `dense`, `rtol`, `atol`: as for `RadauIIA5`. The error that a step-size controller is given is one from which it finds the
+      size for the order of the step, where its coefficients are the default ones; with others steps are of other sizes, and as
+      accurate.
 
     Source: E. Hairer, G. Wanner, *Stiff differential equations solved by Radau methods*, J. Comput. Appl. Math. 111 (1999),
     section 3, and the program RADAU.
