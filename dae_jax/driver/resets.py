@@ -274,7 +274,7 @@ def _level_at_start(
     rate = jnp.where(jnp.isfinite(rate), sign * rate, -before)
     slopes = jax.tree.leaves(jax.grad(of, 1)(t, z))
     terms = sum(jnp.sum(jnp.abs(slope * x)) for slope, x in zip(slopes, jax.tree.leaves(z), strict=True))
-    zero = jnp.abs(rate) * together + ROUND_OFF * jnp.finfo(t.dtype).eps * jnp.where(jnp.isfinite(terms), terms, 0)
-    zero = zero + 2 * moved
+    round_off = ROUND_OFF * jnp.finfo(t.dtype).eps * jnp.where(jnp.isfinite(terms), terms, 0)
+    zero = jnp.abs(rate) * together + round_off + 2 * moved
     leaves = (jnp.abs(value) <= zero) & (rate != 0)
     return lax.stop_gradient(jnp.where(leaves, jnp.where(rate > 0, zero, -zero), value))

@@ -56,7 +56,7 @@ class Radau(Replayable, AbstractResidualSolver):
     step is made by one of them.
 
     After ten steps by one method the next one with more stages takes over where Newton's method needs no second correction, or
-    contracts by θ ≤ 0.002; one with fewer stages where θ ≥ 0.8. The first steps are of order 5. So the order rises with the
+    contracts by θ/(1 − θ) ≤ 0.01; one with fewer stages where θ ≥ 0.8. The first steps are of order 5. So the order rises with the
     smoothness of the solution at the step sizes that the tolerance allows. What holds for `RadauIIA5` otherwise holds here;
     there are three methods to compile, which takes longer than one.
 

@@ -1,7 +1,8 @@
 """What the user's functions take and return, looked at without numbers: wrong ones are refused in a sentence."""
 
 import inspect
-from collections.abc import Callable
+import types
+from collections.abc import Callable, Hashable
 from typing import Any
 
 import equinox as eqx
@@ -15,6 +16,8 @@ from jaxtyping import PyTree
 from ..compiler import equations
 from ..systems import ConstrainedSystem, System, is_mechanism
 from ..types import Args, State, Time
+from .around import of_library
+from .captured import REMEMBERED, Captured
 from .states import NUMBERS, describe
 
 
@@ -27,6 +30,10 @@ LEADING_AXIS = (
     "`y0` must be one state, but has a leading axis of length {}: a time axis as in `sol.ys`, or a batch. Go on from the last "
     "saved state with `y0=sol.final`, that is `jax.tree.map(lambda x: x[-1], sol.ys)`; solve a batch with `jax.vmap`."
 )
+
+
+# The last functions that have been seen to have the same numbers in them each time they are called, by their keys.
+_settled: dict[Hashable, None] = {}
 
 
 def refuse_wrong_functions(system: System, t: Time, state: State, args: Args) -> None:
@@ -75,6 +82,8 @@ def returned(call: str, function: Callable[..., Any], *values: State) -> Any:
     """The shapes that `function` returns for these arguments; `call` is how it is to be called, `force(t, q, v, args)`."""
     refuse_other_arguments(call, function, len(values))
     try:
+        if _is_settled(function):
+            return eqx.filter_eval_shape(function, *values)
         jaxpr, arrays, others = eqx.filter_make_jaxpr(function)(*values)
         again, *_ = eqx.filter_make_jaxpr(function)(*values)
     except TRACED as error:
@@ -91,7 +100,17 @@ def returned(call: str, function: Callable[..., Any], *values: State) -> Any:
             f"`{call}` has other numbers in it each time it is called, such as random ones or the time of day: the compiled program would "
             "go on with those of one call. Find them before, and hand them over in `args`."
         )
+    if isinstance(function, Captured):
+        _settled[function.key] = None
+        for oldest in list(_settled)[:-REMEMBERED]:
+            _settled.pop(oldest, None)
     return eqx.combine(arrays, others)
+
+
+def _is_settled(function: Callable[..., Any]) -> bool:
+    if isinstance(function, Captured):
+        return function.key in _settled
+    return isinstance(function, types.FunctionType) and of_library(function)
 
 
 def _numbers_in(jaxpr: jax.extend.core.ClosedJaxpr) -> list[Any]:
