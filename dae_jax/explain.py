@@ -311,10 +311,10 @@ def _linear_solver(ode: MechanicalODE, count: int) -> str:
         return f"sparse elimination in {counted(len(gram.levels), 'level')}, {counted(gram.cost, 'multiplication')}" + (
             f", then a dense system of {gram.rest_size}" if gram.rest_size > 1 else ""
         )
-    if ode.rank is not None:
-        return f"least norm by eigenvalues, rank {ode.rank[1]} of {count} (LAPACK)"
+    some = "" if ode.rank is None else f"the {ode.rank[1]} that are independent of "
+    of = some + counted(count, "constraint" if some else "unknown")
     kind = "straight-line" if count <= UNROLLED else "a loop over columns" if count <= LOOPED else "Cholesky (LAPACK)"
-    return f"dense elimination of {counted(count, 'unknown')}, {kind}"
+    return f"dense elimination of {of}, {kind}"
 
 
 def _left_out(ode: MechanicalODE, solve: Solve) -> Iterator[str]:

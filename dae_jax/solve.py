@@ -19,6 +19,7 @@ from .driver.problem import Problem, Program, split
 from .driver.program import KEPT, Solve, run, traces
 from .driver.resets import Reset
 from .driver.start import as_array, checked, refuse_bad_start, refuse_bad_times
+from .equations.independent import is_crowded, rows_of
 from .equations.residual_form import LARGE, Form
 from .formulations import (
     AbstractFormulation,
@@ -200,7 +201,7 @@ def _run_on_numbers(program: Program, arrays: Arrays, solve: Solve, problem: Pro
     """
     known = _of_known_rank.get(program)
     if known is None:
-        known = _with_rank(program, solve, problem) if solve.formulation.counts_constraints else program
+        known = _with_rank(program, solve, problem) if _asks_for_rank(solve, problem) else _remembered(program, program)
     sol, as_expected, seconds = run(known, arrays)
     # Inside an outer `jit` the result is no number, although the inputs are: they are looked at each time it is traced.
     inside = isinstance(as_expected, Tracer)
@@ -218,7 +219,22 @@ def _with_rank(program: Program, solve: Solve, problem: Problem) -> Program:
     """The program for the number of constraints that are independent at the start; it is remembered."""
     with jax.ensure_compile_time_eval():
         rank = refuse_bad_start(*problem.start, solve.formulation.inverts_mass)
-    better, _ = split((solve, dataclasses.replace(problem, rank=rank)))
+        rows = rows_of(*problem.start, rank) if rank is not None and solve.needs_independent() else None
+    better, _ = split((solve, dataclasses.replace(problem, rank=rank, rows=rows)))
+    return _remembered(program, better)
+
+
+def _asks_for_rank(solve: Solve, problem: Problem) -> bool:
+    """Whether to look at a start before anything is compiled: where constraints are as many as coordinates, some are redundant or
+    nothing moves.
+    """
+    if solve.formulation.counts_constraints or (solve.needs_independent() and problem.rank is not None):
+        return True
+    with jax.ensure_compile_time_eval():
+        return is_crowded(*problem.start)
+
+
+def _remembered(program: Program, better: Program) -> Program:
     _of_known_rank[program] = better
     for oldest in list(_of_known_rank)[:-KEPT]:
         _of_known_rank.pop(oldest, None)

@@ -30,6 +30,7 @@ METHODS = {
     "dummy-radau": Method(dj.RadauIIA5(), dj.DummyDerivatives()),
     "dummy-bdf": Method(dj.BDF(), dj.DummyDerivatives()),
     "radau-ggl": Method(dj.RadauIIA5(), dj.GGL()),
+    "radau-variable-ggl": Method(dj.Radau(), dj.GGL()),
     "radau-index-2": Method(dj.RadauIIA5(), dj.Residual("index-2")),
     "radau-index-3": Method(dj.RadauIIA5(), dj.Residual("index-3")),
     "bdf-ggl": Method(dj.BDF(), dj.GGL()),

@@ -23,6 +23,7 @@ from ..solvers import (
     RATTLE,
     Gauss4,
     OrthogonalProjection,
+    Radau,
     RadauIIA5,
     SymmetricProjection,
     TangentSpace,
@@ -53,7 +54,7 @@ def methods(scene: Scene) -> dict[str, Method]:
     where it is not stiff.
     """
     if not is_mechanism(scene.system):
-        implicit = {"radau": Method(RadauIIA5()), "bdf": Method(BDF())}
+        implicit = {"radau": Method(RadauIIA5()), "radau-variable": Method(Radau()), "bdf": Method(BDF())}
         if scene.stiff:
             return implicit
         return implicit | {
@@ -75,6 +76,7 @@ def methods(scene: Scene) -> dict[str, Method]:
         "tangent-space": Method(TangentSpace(DOP853())),
         "rattle": Method(RATTLE(), step=0.01),
         "radau-ggl": Method(RadauIIA5()),
+        "radau-variable-ggl": Method(Radau()),
         "radau-index-2": Method(RadauIIA5(), Residual("index-2")),
         "radau-index-3": Method(RadauIIA5(), Residual("index-3")),
         "bdf-ggl": Method(BDF()),

@@ -149,6 +149,14 @@ def _forward(fn: Callable[..., Any]) -> Callable[..., Any]:
 
     @solve.defjvp
     def _(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
-        return _forward(lambda p, t: jax.jvp(fn, p, t))(primals, tangents)
+        def pushed(primals: tuple[PyTree, ...], directions: list[Array]) -> Any:
+            # An integer's tangent has no numbers.
+            rest = iter(directions)
+            nothing = lambda x: np.zeros(jnp.shape(x), jax.dtypes.float0)
+            whole = jax.tree.map(lambda x: next(rest) if is_inexact(x) else nothing(x), primals)
+            return jax.jvp(fn, primals, whole)
+
+        pairs = zip(jax.tree.leaves(primals), jax.tree.leaves(tangents), strict=True)
+        return _forward(pushed)(primals, [dx for x, dx in pairs if is_inexact(x)])
 
     return solve

@@ -65,7 +65,7 @@ class View(eqx.Module):
 def call(solve: "Solve", problem: Problem) -> tuple[Any, ...]:
     """`diffrax.diffeqsolve` on what the formulation makes of the problem; the fields of its solution, and the end."""
     t0, t1, dt0, args = problem.t0, problem.t1, problem.dt0, problem.args
-    y, ode = solve.formulation.encode(*problem.start, problem.rank)
+    y, ode = solve.encoded(problem)
     decode = Decode(solve.formulation, solve.solver)
     solver, controller = economical(solve.solver, solve.between()), _fitted(solve.controller, t0, t1)
     if takes_residuals(solver):

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Int
 
 from ..consistent import unsolved, violation
 from ..equations.constraint_jacobian import Rank
+from ..equations.independent import Rows, independent
 from ..equations.mechanical import MechanicalODE
 from ..equations.regularity import DRIFTED, LARGE, has_rank, is_near_constraints, mass_is_regular, weakest
 from ..systems import System, is_mechanism
@@ -50,25 +51,32 @@ def look(
     start: State,
     args: Args,
     rank: int | Rank | None,
+    rows: Rows | None,
     invertible: bool,
     end: tuple[Scalar, State],
     keeps: tuple[bool, bool],
     tolerances: tuple[Time, Time],
     residual: bool,
 ) -> tuple[Start, End]:
-    """The start and the `end` (t, y) of a solve. `invertible`: whether M must be."""
+    """The start and the `end` (t, y) of a solve. `rows`: the constraints that the method gets where not all; `invertible`: whether M
+    must be.
+    """
     if not is_mechanism(system):
         return _look_at_equations(system, t0, start, args, end, tolerances)
     ode = MechanicalODE.of(system, t0, start, args, rank)
     y, (t, y_end) = ode.encode(start), (end[0], ode.encode(end[1]))
     consistent, regular = violation(ode, t0, y).consistent(), mass_is_regular(ode, y[0], invertible)
     fits, surely = has_rank(ode, t0, y, ode.rank)
+    some = ode
+    if rows is not None:
+        some = MechanicalODE.of(independent(system, t0, start, args, ode.rank, rows), t0, start, args)
+        fits, surely = (a & b for a, b in zip((fits, surely), has_rank(some, t0, y, None), strict=True))
     wrong = jnp.where(regular, jnp.where(consistent, jnp.where(fits, 0, 2), 1), 3)
     at_start = Start(wrong, (wrong == 0) & surely)
 
     near, drifted = is_near_constraints(ode, t, y, y_end, keeps, tolerances, residual)
     yes = jnp.asarray(True)
-    singular = ~yes if ode.rank else weakest(ode, t, y_end) < jnp.finfo(t.dtype).eps ** SINGULAR
+    singular = ~yes if some.rank else weakest(some, t, y_end) < jnp.finfo(t.dtype).eps ** SINGULAR
     if not callable(system.mass):
         return at_start, End(near, singular, yes, yes, drifted)
     (q, v), finite = y_end, jnp.all(jnp.isfinite(y_end[0]))

@@ -12,6 +12,7 @@ from jaxtyping import PyTree
 from ..compiler import one_kernel_enabled
 from ..compiler.types import Arrays
 from ..equations.constraint_jacobian import Rank
+from ..equations.independent import Rows
 from ..systems import System
 from ..types import Args, Scalar, State
 from ..validate.closures import opened
@@ -20,12 +21,12 @@ from ..validate.closures import opened
 @functools.partial(
     jax.tree_util.register_dataclass,
     data_fields=("system", "t0", "t1", "dt0", "y0", "args"),
-    meta_fields=("rank",),
+    meta_fields=("rank", "rows"),
 )
 @dataclasses.dataclass(frozen=True, eq=False)
 class Problem:
-    """All of a solve but its method: a system from `t0` to `t1`, its start, and how many of its constraints are
-    independent there (`None`: all).
+    """All of a solve but its method: a system from `t0` to `t1`, its start, how many of its constraints are independent there
+    (`None`: all), and which of them a method gets that cannot do with more (`None`: found in the solve).
     """
 
     system: System
@@ -35,6 +36,7 @@ class Problem:
     y0: State
     args: Args
     rank: int | Rank | None
+    rows: Rows | None = None
 
     @property
     def start(self) -> tuple[System, Scalar, State, Args]:

@@ -14,6 +14,7 @@ from jaxtyping import PyTree
 from .._compat import is_captured, trace_state_clean
 from ..compiler import PullBack, inexact, one_kernel, waiting
 from ..compiler.types import Arrays
+from ..equations.independent import independent
 from ..equations.regularity import COARSE
 from ..formulations import AbstractFormulation
 from ..solution import DAESolution
@@ -123,6 +124,17 @@ class Solve:
         """Whether g and (ġ, h) hold at each step."""
         return (True, True) if isinstance(self.solver, AbstractManifoldSolver) else self.formulation.keeps
 
+    def needs_independent(self) -> bool:
+        """Whether the method cannot do with redundant constraints."""
+        return self.formulation.needs_independent or getattr(self.solver, "needs_independent", False)
+
+    def encoded(self, problem: Problem) -> tuple[Any, Any]:
+        """The start in the solver's variables, and the equations that it gets."""
+        start = problem.t0, problem.y0, problem.args
+        if problem.rank is None or not self.needs_independent():
+            return self.formulation.encode(problem.system, *start, problem.rank)
+        return self.formulation.encode(independent(*problem.start, problem.rank, problem.rows), *start)
+
     def refuse_wrong_functions(self, problem: Problem) -> None:
         """Refuses functions of the user that do not take or return what they must, and a system that the method is not for,
         in a sentence.
@@ -146,7 +158,7 @@ class Solve:
         else:
             tolerances = (0.0, 0.0) if residual else (COARSE, COARSE)
         program, arrays = split((*problem.start, end, tolerances, self.event))
-        invertible, rank = self.formulation.inverts_mass, problem.rank
+        invertible, rank, rows = self.formulation.inverts_mass, problem.rank, problem.rows
 
         def check(arrays: Arrays) -> Any:
             system, t0, y0, args, end, tolerances, event = program.whole(arrays)
@@ -155,7 +167,7 @@ class Solve:
             finite = [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(state)]
             defined = [~jnp.isnan(condition(t, state, args)) for condition in conditions]
             numbers = (jnp.all(jnp.stack(finite)), jnp.all(jnp.asarray(defined, bool)))
-            return *look(system, t0, y0, args, rank, invertible, end, keeps, tolerances, residual), numbers
+            return *look(system, t0, y0, args, rank, rows, invertible, end, keeps, tolerances, residual), numbers
 
         return check, arrays
 
@@ -205,7 +217,7 @@ class Solve:
         return pull_back
 
     def _taped(self, problem: Problem) -> Taped:
-        y, ode = self.formulation.encode(*problem.start, problem.rank)
+        y, ode = self.encoded(problem)
         part = self.saveat.subs
         solver = economical(self.solver, self.between())
         view = View(part.fn, Decode(self.formulation, self.solver), problem.args)

@@ -45,8 +45,20 @@ def checked(system: System, t0: Time, t1: Time, dt0: Time | None, y0: State, arg
         if (t1 - t0) * dt0 < 0:
             raise ValueError(f"`dt0` = {dt0} points away from `t1` = {t1}: it must have the sign of t1 − t0.")
     dtype = jnp.result_type(*jax.tree.leaves(y0))
+    _refuse_times_of_one_number(t0, t1, dtype)
     y0 = jax.tree.map(lambda x: as_array(x, dtype), tuple(y0) if len(system.parts) > 1 else y0)
     return y0, jax.tree.map(lambda x: np.asarray(x, jnp.result_type(x)) if isinstance(x, float) else x, args)
+
+
+def _refuse_times_of_one_number(t0: Time, t1: Time, dtype: DType) -> None:
+    """Refuses an interval that has no length in the numbers of the state."""
+    if any(isinstance(x, Tracer) for x in (t0, t1)) or t0 == t1:
+        return
+    if np.asarray(t0, dtype) == np.asarray(t1, dtype):
+        raise ValueError(
+            f"`t0` = {t0} and `t1` = {t1} are one number in {np.dtype(dtype)}, which `y0` is in: measure time from another origin, or "
+            "use float64."
+        )
 
 
 def refuse_no_time(name: str, value: Time | None) -> None:

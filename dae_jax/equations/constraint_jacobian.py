@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..linalg import Elimination, SparseDefinite, elimination, semidefinite_solve, take
+from ..linalg import Elimination, SparseDefinite, elimination, independent_rows, semidefinite_solve, take
 from ..linalg.semidefinite import LOOPED
 from ..structure import column_colouring, dependence, seed_matrix
 from ..types import Flat, Time
@@ -48,10 +48,20 @@ class DenseNormals:
     nonholonomic: int
     rank: Rank | None
 
-    def at(self, ode: Mechanism, t: Time, q: Flat, v: Flat) -> tuple[Float[Array, "c n"], Float[Array, "n c"]]:
-        """A and M⁻¹Aᵀ: the normals in the metric of the mass matrix."""
+    def at(
+        self, ode: Mechanism, t: Time, q: Flat, v: Flat
+    ) -> tuple[Float[Array, "c n"], Float[Array, "n c"], Float[Array, " c"] | None]:
+        """A and M⁻¹Aᵀ, the normals in the metric of the mass matrix; and where some constraints depend on others 1 for each of as
+        many as are independent, 0 for the others.
+        """
         a = ode.constraint_jacobian(t, q, v)
-        return a, mass_solve(ode.mass(q), a.T)
+        n = mass_solve(ode.mass(q), a.T)
+        if self.rank is None:
+            return a, n, None
+        gram = _matmul(a, n)
+        scale = unit_diagonal(gram)
+        counts = (self.holonomic, self.rank[0]), (len(a), self.rank[1])
+        return a, n, independent_rows(gram * scale[:, None] * scale, counts).astype(q.dtype)
 
     def along(self, ode: Mechanism, normals: Normals, x: Float[Array, " n"]) -> Float[Array, " c"]:
         """A x."""
@@ -62,15 +72,30 @@ class DenseNormals:
         return matvec(normals[1][:, : mu.shape[0]], mu)
 
     def gram_solve(self, ode: Mechanism, normals: Normals, b: Float[Array, " c"]) -> Float[Array, " c"]:
-        """x with A M⁻¹Aᵀ x = b, of the first constraints where b is shorter."""
-        a, n = normals[0][: b.shape[0]], normals[1][:, : b.shape[0]]
-        gram = _matmul(a, n)
+        """x with A M⁻¹Aᵀ x = b, of the first constraints where b is shorter; 0 where constraints depend on others."""
+        gram = self._gram(normals, b.shape[0])
+        if normals[2] is None:
+            return semidefinite_solve(gram, b)
+        kept = self.independent(normals)[: b.shape[0]]
+        return kept * semidefinite_solve(of_rows(gram, kept), kept * b)
+
+    def least_norm(self, ode: Mechanism, normals: Normals, b: Float[Array, " c"]) -> Float[Array, " c"]:
+        """The shortest such x, of b that satisfies all constraints."""
+        gram = self._gram(normals, b.shape[0])
         if self.rank is None:
             return semidefinite_solve(gram, b)
         # Which constraints depend on each other has nothing to do with their scale.
         scale = unit_diagonal(gram)
-        rank = self.rank[b.shape[0] == self.holonomic + self.nonholonomic]
-        return scale * semidefinite_solve(gram * scale[:, None] * scale, scale * b, rank)
+        return scale * semidefinite_solve(gram * scale[:, None] * scale, scale * b, self.rank[1])
+
+    @staticmethod
+    def independent(normals: Normals) -> Float[Array, " c"]:
+        """1 for each of as many constraints as are independent, where some depend on others."""
+        return normals[2]
+
+    @staticmethod
+    def _gram(normals: Normals, rows: int) -> Float[Array, "c c"]:
+        return _matmul(normals[0][:rows], normals[1][:, :rows])
 
     def lengths(self, ode: Mechanism, normals: Normals) -> Float[Array, " c"]:
         """The length of each row of A."""
@@ -132,6 +157,10 @@ class SparseNormals:
         at = lambda x, entries: jax.vmap(lambda row: take(row, entries))(x)
         couplings = jnp.sum(shared * at(weighted, rows) * at(compressed, columns), 0)
         return self.gram.solve(jnp.sum(weighted * compressed, 0), couplings, b)
+
+    def least_norm(self, ode: Mechanism, normals: Normals, b: Float[Array, " c"]) -> Float[Array, " c"]:
+        """The only such x: no constraint depends on others."""
+        return self.gram_solve(ode, normals, b)
 
     @traced_once
     def lengths(self, ode: Mechanism, normals: Normals) -> Float[Array, " c"]:
@@ -203,6 +232,11 @@ def dense_mass(mass: Float[Array, "..."] | None) -> Float[Array, "..."] | None:
         return mass
     count, k, _ = mass.shape
     return (jnp.eye(count, dtype=mass.dtype)[:, None, :, None] * mass[:, :, None, :]).reshape(count * k, count * k)
+
+
+def of_rows(s: Float[Array, "c c"], kept: Float[Array, " c"]) -> Float[Array, "c c"]:
+    """S with its rows and columns where `kept` is 1, elsewhere the unit matrix."""
+    return s * kept[:, None] * kept + jnp.eye(len(s), dtype=s.dtype) * (1 - kept)
 
 
 def unit_diagonal(s: Float[Array, "c c"]) -> Float[Array, " c"]:

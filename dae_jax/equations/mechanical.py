@@ -22,9 +22,8 @@ from .constraint_jacobian import (
     SparseNormals,
     constraint_pattern,
     mass_solve,
-    matvec,
+    of_rows,
     sparse_normals,
-    unit_diagonal,
 )
 from .manifold_ode import Feedback, ManifoldODE, Normals, at_one_instant
 
@@ -160,27 +159,28 @@ class MechanicalODE(ManifoldODE):
     @at_one_instant
     def field(self, t: Time, y: Phase, feedback: Feedback | None = None) -> Any:
         q, v = y
-        return v, self._accelerations(t, q, v, feedback)[0]
+        return v, self._accelerations(t, q, v, feedback)
 
     @at_one_instant
     def multipliers(self, t: Time, y: Phase) -> Float[Array, " mp"]:
         """(λ, μ), of least norm where constraints are redundant."""
-        return self._accelerations(t, *y, None)[1]
+        normals, _, target = self._free(t, *y)
+        return self.linear.least_norm(self, normals, target)
 
-    def _accelerations(
-        self, t: Time, q: Flat, v: Flat, feedback: Feedback | None
-    ) -> tuple[Float[Array, " n"], Float[Array, " mp"]]:
+    def _free(self, t: Time, q: Flat, v: Flat) -> tuple[Normals, Float[Array, " n"], Float[Array, " mp"]]:
+        """The normals, M⁻¹f, and A M⁻¹f + γ, which is A M⁻¹Aᵀ(λ, μ)."""
         normals = self.normals(t, (q, v))
         free = mass_solve(self.mass(q), self.force(t, q, v))
-        target = self.bias(t, q, v)
+        return normals, free, self.linear.along(self, normals, free) + self.bias(t, q, v)
+
+    def _accelerations(self, t: Time, q: Flat, v: Flat, feedback: Feedback | None) -> Float[Array, " n"]:
+        normals, free, target = self._free(t, q, v)
         if feedback is not None:
             target = target + self._feedback(t, q, v, feedback)
-        target = self.linear.along(self, normals, free) + target
-        multipliers = self.linear.gram_solve(self, normals, target)
-        pulled = self.linear.lift(self, normals, multipliers)
+        pulled = self.linear.lift(self, normals, self.linear.gram_solve(self, normals, target))
         if self.rank is not None:
             pulled = self._unless_contradictory(t, (q, v), normals, target, pulled)
-        return free - pulled, multipliers
+        return free - pulled
 
     def _unless_contradictory(
         self, t: Time, y: Phase, normals: Normals, target: Float[Array, " c"], pulled: Flat
@@ -257,8 +257,9 @@ class MechanicalODE(ManifoldODE):
             return fixed_point(lambda mu: MechanicalODE.correction(*point, mu), *first)
 
         params = (self, t, y, normals, tuple(jax.lax.stop_gradient(first)))
-        linear_solve = solve if self.rank is None else _minimum_norm
-        mu, found = implicit_root(_manifold_residual, iterate, params, linear_solve=linear_solve)
+        mu, found = implicit_root(
+            _manifold_residual, iterate, params, linear_solve=_on_rows, jacobian=_manifold_jacobian
+        )
         displaced = self.displace(y, normals, mu)
         return displaced, found if self.rank is None else found & self._all_hold(t, displaced)
 
@@ -291,12 +292,21 @@ def _manifold_residual(mu: Float[Array, " c"], params: PyTree) -> Float[Array, "
     return jnp.concatenate(ode.invariants(t, ode.displace(y, normals, mu)))
 
 
-def _minimum_norm(a: Float[Array, "c c"], b: Float[Array, " c"]) -> Float[Array, " c"]:
-    # The relative cut-off separates redundancy from conditioning: on the manifold the dependent rows agree to round-off.
-    # Constraints may have any scale.
-    scale = unit_diagonal(a)
-    inverse = jnp.linalg.pinv(a * scale[:, None] * scale, rtol=float(jnp.finfo(a.dtype).eps) ** 0.5)
-    return scale * matvec(inverse, scale * b)
+def _manifold_jacobian(mu: Float[Array, " c"], params: PyTree) -> tuple[Float[Array, "c c"], Float[Array, " c"] | None]:
+    """That of `_manifold_residual`; where constraints depend on others, which of them are solved."""
+    ode, _, _, normals, _ = params
+    matrix = jax.jacfwd(_manifold_residual)(mu, params)
+    if ode.rank is None:
+        return matrix, None
+    kept = ode.linear.independent(normals)
+    return matrix, jnp.concatenate([kept[: ode.holonomic], kept])
+
+
+def _on_rows(
+    system: tuple[Float[Array, "c c"], Float[Array, " c"] | None], b: Float[Array, " c"]
+) -> Float[Array, " c"]:
+    matrix, kept = system
+    return solve(matrix, b) if kept is None else solve(of_rows(matrix, kept), kept * b)
 
 
 def _outline(function: Callable[..., Any] | None, *args: PyTree) -> tuple[int, bool]:

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..linalg import minor_sign, row_products, semidefinite_solve, smallest_pivot
+from ..linalg import independent_rows, minor_sign, row_products, semidefinite_solve, smallest_pivot
 from ..types import IntScalar, Phase, Time
-from .constraint_jacobian import Rank, SparseNormals, mass_solve, matvec, unit_diagonal
+from .constraint_jacobian import Rank, SparseNormals, mass_solve, matvec, of_rows, unit_diagonal
 from .mechanical import MechanicalODE, allowed_contradiction
 
 
@@ -92,7 +92,7 @@ class Redundancy(eqx.Module):
 def redundancy(ode: MechanicalODE, t: Time, y: Phase) -> Redundancy:
     """Whether constraints depend on each other at the flat state y = (q, v)."""
     m = ode.holonomic
-    a, scale = _unit_rows(ode, t, y)
+    a, scale = unit_rows(ode, t, y)
     values, vectors = jnp.linalg.eigh(a @ a.T)
     cut = jnp.finfo(a.dtype).eps ** 0.5
     independent = values > cut * values[-1]
@@ -109,11 +109,11 @@ def weakest(ode: MechanicalODE, t: Time, y: Phase) -> Float[Array, ""]:
         ones = jnp.ones(ode.holonomic, y[0].dtype)
         regular = jnp.all(jnp.isfinite(ode.linear.gram_solve(ode, ode.normals(t, y), ones)))
         return jnp.where(regular, 1.0, 0.0).astype(y[0].dtype)
-    a, _ = _unit_rows(ode, t, y)
+    a, _ = unit_rows(ode, t, y)
     return smallest_pivot(jnp.sum(a[:, None] * a, -1))
 
 
-def _unit_rows(ode: MechanicalODE, t: Time, y: Phase) -> tuple[Float[Array, "mp n"], Float[Array, " mp"]]:
+def unit_rows(ode: MechanicalODE, t: Time, y: Phase) -> tuple[Float[Array, "mp n"], Float[Array, " mp"]]:
     """A with rows of length 1, and what they were multiplied by; rows of zeros as they are."""
     a = ode.constraint_jacobian(t, *y)
     lengths = jnp.sqrt(jnp.sum(a * a, 1))
@@ -139,12 +139,12 @@ def _agree_nearby(
 
     def corrected(_: IntScalar, y: Phase) -> Any:
         q, v = y
-        a, scale = _unit_rows(ode, t, (q, v))
+        a, scale = unit_rows(ode, t, (q, v))
         if m:
             q = q - nearest(a[:m], ode.constraint(t, q) * scale[:m], holonomic)
         return q, v - nearest(a, ode.velocity_constraint(t, q, v) * scale, rank)
 
-    a, _ = _unit_rows(ode, t, y)
+    a, _ = unit_rows(ode, t, y)
     tangent = lambda a, x, rank: x - nearest(a, a @ x, rank)
     moved = q + tangent(a[:m], away(q), holonomic) if m else q + away(q), v + tangent(a, away(v), rank)
     nearby = jax.lax.fori_loop(0, 8, corrected, moved)
@@ -227,7 +227,11 @@ def _drifted_over(ode: MechanicalODE, t: Time, y: Phase, g: Float[Array, "m n"])
     """
     gram, lifted, scale = _gram(ode, y, g)
     rank = None if ode.rank is None else ode.rank[0]
-    multipliers = scale * semidefinite_solve(gram * scale[:, None] * scale, scale * ode.constraint(t, y[0]), rank)
+    off, matrix = ode.constraint(t, y[0]), gram
+    if rank is not None:
+        kept = independent_rows(gram * scale[:, None] * scale, ((len(g), rank),)).astype(off.dtype)
+        off, matrix = kept * off, of_rows(gram, kept)
+    multipliers = semidefinite_solve(matrix, off)
     nearest = y[0] - matvec(lifted.T, multipliers)
     change = row_products(jax.jacfwd(ode.constraint, 1)(t, nearest), lifted) - gram
     return _is_turned(gram + FAR * change, scale, rank) | _is_turned(gram - FAR * change, scale, rank)
@@ -282,7 +286,7 @@ def _redundant_agree(ode: MechanicalODE, t: Time, y: Phase, root: float | np.flo
     """Whether constraints that depend on others are off as these are: by what they have in common, not by a difference."""
     if ode.rank is None:
         return jnp.asarray(True)
-    a, scale = _unit_rows(ode, t, y)
+    a, scale = unit_rows(ode, t, y)
     agree = jnp.asarray(True)
     for level, rank, x in zip(ode.invariants(t, y), ode.rank, y, strict=True):
         rows = len(level)

@@ -7,7 +7,7 @@ import numpy as np
 from ..equations.derivative_orders import find_offsets
 from ..equations.residual_form import Form, ResidualForm
 from ..structure import dependence_patterns, in_short, maximum_matching, variables_of
-from ..systems import System
+from ..systems import System, is_mechanism
 from ..types import Args, State, Time
 
 
@@ -26,12 +26,18 @@ def why_not_as_written(system: System, t: Time, state: State, args: Args, form: 
     dtype = jnp.result_type(*jax.tree.leaves(state))
     try:
         found = find_offsets(residual, dtype)
+    except ValueError:
+        if not is_mechanism(system):
+            raise
+        # Structurally singular with all constraints: some are redundant. With as many as are independent the index is known.
+        index = 3 if form == "index-3" else 2
+        return f"the index of the multipliers is {index}, and {_up_to(highest)}" if index > highest else ""
     except NotImplementedError:
         # A primitive that structural analysis does not know: nothing is known of the index.
         return ""
     if found.index > highest:
         beyond = [name for name, k in zip(residual.variables, found.indices, strict=True) if k > highest]
-        return f"the index of {in_short(beyond)} is {found.index}, and it converges for an index up to {highest}"
+        return f"the index of {in_short(beyond)} is {found.index}, and {_up_to(highest)}"
     independent = [j for j in maximum_matching(variables_of(found.by_rate), residual.size) if j is not None]
     if found.index < 2 or len(independent) == len(np.unique(found.by_rate.indices)):
         return ""
@@ -44,3 +50,7 @@ def why_not_as_written(system: System, t: Time, state: State, args: Args, form: 
         f"the index is {found.index}, and there are fewer equations with derivatives than variables whose derivative occurs, "
         "in combinations that change, for which it may be unstable"
     )
+
+
+def _up_to(highest: int) -> str:
+    return f"it converges for an index up to {highest}"

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from ..equations.constraint_jacobian import Rank
+from ..equations.independent import independent
 from ..equations.index1_form import Index1Form
 from ..equations.linearised import LinearisedResidual
 from ..equations.residual_form import ResidualForm
@@ -32,6 +33,7 @@ class DummyDerivatives(AbstractFieldFormulation):
     """
 
     inverts_mass: ClassVar[bool] = False
+    needs_independent: ClassVar[bool] = True
     selects_states: ClassVar[bool] = True
 
     @property
@@ -39,6 +41,8 @@ class DummyDerivatives(AbstractFieldFormulation):
         return True, True
 
     def encode(self, system: System, t: Time, state: State, args: Args = None, rank: int | Rank | None = None) -> Any:
+        if rank is not None:
+            system = independent(system, t, state, args, rank)
         form = ResidualForm.of(system, t, state, args)
         ode = StructuralODE.of(form, jnp.result_type(*jax.tree.leaves(state)))
         return ode.encode(t, state), ode
@@ -51,6 +55,7 @@ class ReducedResidual(AbstractResidualFormulation):
     """The equations of `DummyDerivatives` for a solver of residuals: see `Index1Form`."""
 
     inverts_mass: ClassVar[bool] = False
+    needs_independent: ClassVar[bool] = True
 
     @property
     def name(self) -> str:

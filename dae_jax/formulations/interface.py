@@ -31,6 +31,7 @@ class AbstractFormulation(eqx.Module):
     - `selects_states`: whether entries of the state are selected that alone are integrated.
     - `changes_field`: whether the field is another than that of the underlying ODE.
     - `counts_constraints`: whether the size of the state depends on how many constraints are independent.
+    - `needs_independent`: whether constraints must be independent, so that of redundant ones it gets as many as are.
     """
 
     inverts_mass: ClassVar[bool] = True
@@ -38,6 +39,7 @@ class AbstractFormulation(eqx.Module):
     selects_states: ClassVar[bool] = False
     changes_field: ClassVar[bool] = True
     counts_constraints: ClassVar[bool] = False
+    needs_independent: ClassVar[bool] = False
 
     @property
     def name(self) -> str:

@@ -5,6 +5,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 
 from ..equations.constraint_jacobian import Rank
+from ..equations.independent import independent
 from ..equations.linearised import LinearisedResidual
 from ..equations.residual_form import Form, ResidualForm
 from ..systems import System
@@ -25,6 +26,7 @@ class Residual(AbstractResidualFormulation):
     """
 
     inverts_mass: ClassVar[bool] = False
+    needs_independent: ClassVar[bool] = True
 
     form: Form = eqx.field(static=True, default="GGL")
     variable_index: tuple[int, ...] | None = eqx.field(static=True, default=None)
@@ -40,17 +42,13 @@ class Residual(AbstractResidualFormulation):
     def encode(
         self, system: System, t: Time, state: State, args: Args = None, rank: int | Rank | None = None
     ) -> tuple[Any, LinearisedResidual]:
+        if rank is not None:
+            system = independent(system, t, state, args, rank)
         form = ResidualForm.of(system, t, state, args, self.form)
         if self.variable_index is not None and len(self.variable_index) != form.size:
             raise ValueError(
                 f"`variable_index` must have a number for each of {', '.join(form.variables)}: {form.size} in all, but has "
                 f"{len(self.variable_index)}."
-            )
-        if rank is not None:
-            raise ValueError(
-                f"Some constraints are redundant (`rank` is {rank}), which leaves their multipliers undetermined: a residual "
-                "needs independent ones, also where `rank` is given. Remove the redundant constraints, or use a solver of the "
-                "underlying ODE such as OrthogonalProjection, for which `rank=` says how many are independent."
             )
         form, y = form.at_start(t, state)
         linearised = LinearisedResidual.of(form, y, self.variable_index)

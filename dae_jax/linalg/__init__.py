@@ -17,6 +17,10 @@ from .newton import (
     roundoff as roundoff,
 )
 from .norm import error_norm as error_norm, rms_norm as rms_norm
-from .semidefinite import semidefinite_solve as semidefinite_solve, smallest_pivot as smallest_pivot
+from .semidefinite import (
+    independent_rows as independent_rows,
+    semidefinite_solve as semidefinite_solve,
+    smallest_pivot as smallest_pivot,
+)
 from .sparse_definite import SparseDefinite as SparseDefinite
 from .tearing import Tearing as Tearing, tearing as tearing

@@ -1,12 +1,12 @@
 """Symmetric positive (semi)definite systems S x = b, such as G M⁻¹ Gᵀ λ = b."""
 
 import functools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from ..types import IntScalar
 
@@ -15,6 +15,8 @@ from ..types import IntScalar
 # into one kernel; LAPACK above.
 UNROLLED = 8
 LOOPED = 48
+# A row of length 1 is independent of others beyond doubt where this part of the square of its length is.
+CLEAR = 0.01
 
 
 def semidefinite_solve(
@@ -51,6 +53,30 @@ def smallest_pivot(s: Float[Array, "m m"]) -> Float[Array, ""]:
         return s - s[:, j][:, None] * row, jnp.minimum(smallest, pivot)
 
     return jax.lax.fori_loop(0, s.shape[0], eliminate, (s, jnp.asarray(jnp.inf, s.dtype)))[1]
+
+
+def independent_rows(s: Float[Array, "m m"], counts: Sequence[tuple[int, int]]) -> Bool[Array, " m"]:
+    """Which rows of symmetric, positive semidefinite S, whose diagonal is 1 (or 0), are taken as independent. For each (rows, rank):
+    of the first `rows` rows there are to be `rank`, with those that are taken before.
+
+    The first of those that are independent beyond doubt is taken, so that the choice does not change with round-off; where there is
+    none, the one that is so the most.
+    """
+    m = len(s)
+    place = jnp.arange(m)
+
+    def take(rows: int, _: IntScalar, carry: tuple[Float[Array, "m m"], Bool[Array, " m"]]) -> Any:
+        s, taken = carry
+        left = jnp.where((place < rows) & ~taken, jnp.sum(s * jnp.eye(m, dtype=s.dtype), 1), -1)
+        here = place == jnp.argmax(jnp.where(left > CLEAR, 2.0 + m - place, left))
+        pivot, row = jnp.sum(jnp.where(here, left, 0)), jnp.sum(jnp.where(here[:, None], s, 0), 0)
+        return s - row[:, None] * (row / jnp.where(pivot > 0, pivot, 1)), taken | here
+
+    carry, done = (jax.lax.stop_gradient(s), jnp.zeros(m, bool)), 0
+    for rows, rank in counts:
+        carry = jax.lax.fori_loop(done, rank, functools.partial(take, rows), carry)
+        done = rank
+    return carry[1]
 
 
 def definite_pivot(pivot: Float[Array, "*k"], diagonal: Float[Array, "*k"], m: int) -> Float[Array, "*k"]:

@@ -73,7 +73,7 @@ def operators(n: int) -> Any:
     spread = (np.eye(n, n - 1) - np.eye(n, n - 1, -1)) * n
     faces = -spread.T @ spread
     cells = (np.eye(n, k=1) + np.eye(n, k=-1) - np.diag([3.0, *[2.0] * (n - 2), 3.0])) * n**2
-    cell, fewer = np.eye(n), np.eye(n - 1)
+    cell, fewer = sparse.eye_array(n), sparse.eye_array(n - 1)
     along_x = sparse.kron(faces, cell) + sparse.kron(fewer, cells)
     along_y = sparse.kron(cells, fewer) + sparse.kron(cell, faces)
     divergence = sparse.csr_array(sparse.hstack([sparse.kron(spread, cell), sparse.kron(cell, spread)]))

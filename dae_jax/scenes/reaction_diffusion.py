@@ -100,7 +100,8 @@ def neumann_laplacian(n: int) -> Any:
 
     line = np.eye(n, k=1) + np.eye(n, k=-1) - 2 * np.eye(n)
     line[0, 1] = line[-1, -2] = 2.0
-    return sparse.csr_array(sparse.kronsum(line, line)) * (n - 1) ** 2
+    own = sparse.eye_array(n)
+    return sparse.csr_array(sparse.kron(own, line) + sparse.kron(line, own)) * (n - 1) ** 2
 
 
 def predators(prey: np.ndarray, growth: np.ndarray, laplacian: Any) -> np.ndarray:

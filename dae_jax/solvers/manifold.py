@@ -27,11 +27,13 @@ class AbstractManifoldSolver(diffrax.AbstractSolver):
 
     - `recomputable`: whether a step can be done once more from its start alone.
     - `locates_events`: whether diffrax can look for an event on its dense output.
+    - `needs_independent`: whether constraints must be independent, so that of redundant ones it gets as many as are.
     - `counts`: which entries of its state at the end of a solve are counts for `stats`.
     """
 
     recomputable: ClassVar[bool] = True
     locates_events: ClassVar[bool] = True
+    needs_independent: ClassVar[bool] = False
     counts: ClassVar[tuple[str, ...]] = ()
 
     @abc.abstractmethod

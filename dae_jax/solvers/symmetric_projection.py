@@ -1,6 +1,6 @@
 """Symmetric projection (Pöll, Hafner and Heinzl, sec. 2.5)."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import diffrax
 import jax
@@ -30,6 +30,8 @@ class SymmetricProjection(AbstractManifoldSolver):
 
     Source: E. Hairer, C. Lubich, G. Wanner, *Geometric Numerical Integration*, V.4.1, algorithm 4.1.
     """
+
+    needs_independent: ClassVar[bool] = True
 
     solver: AbstractImplicitSolver
 

@@ -13,7 +13,7 @@ from jax.scipy.special import gammaincc
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ..solution import AccuracyWarning
-from ..types import DType
+from ..types import DType, Scalar
 from ..validate.states import NUMBERS, brief, describe
 from .identified import Identified, named
 from .least_squares import Factors, Minimum, factors, minimum
@@ -113,7 +113,10 @@ def _identified(
     p, unravel = ravel_pytree(params)
     measured, unravel_data = ravel_pytree(data)
     dtype = min((leaf.dtype for leaf in jax.tree.leaves(params)), key=lambda dtype: jnp.finfo(dtype).bits)
-    weights = jnp.ones((), dtype)
+    # Squares of data that are very small or large would be 0 or infinite.
+    largest = jnp.max(jnp.abs(measured), initial=0)
+    unit = jnp.where(largest > 0, largest, 1)
+    weights = (1 / unit).astype(dtype)
     if sigmas is not None:
         sigma = ravel_pytree(sigmas)[0]
         # One that is traced is looked at here.
@@ -136,13 +139,16 @@ def _identified(
         value_and_jacobian, start, known=sigmas is not None, magnitude=magnitude, tolerance=tolerance, steps=steps
     )
     finite = jnp.all(jnp.isfinite(end.jacobian)) & jnp.all(jnp.isfinite(end.residual))
-    found = _statistics(end, at(end.x), in_log, sigmas is not None)
+    unit = 1.0 if sigmas is not None else unit.astype(dtype)
+    found = _statistics(end, at(end.x), in_log, sigmas is not None, unit)
     residuals = unravel_data((-end.residual / weights).astype(measured.dtype))
     return found._replace(residuals=residuals), ~(end.converged & finite)
 
 
-def _statistics(end: Minimum, params: PyTree, in_log: Bool[np.ndarray, " p"], known: bool) -> Identified:
-    """All but the residuals in units of the data."""
+def _statistics(
+    end: Minimum, params: PyTree, in_log: Bool[np.ndarray, " p"], known: bool, unit: Scalar | float
+) -> Identified:
+    """All but the residuals in units of the data. `unit`: that of the residuals."""
     values, unravel = ravel_pytree(params)
     r, jacobian = end.residual, end.jacobian
     # With fewer data than parameters, directions that no datum sees have no row.
@@ -163,12 +169,12 @@ def _statistics(end: Minimum, params: PyTree, in_log: Bool[np.ndarray, " p"], kn
         covariance=covariance,
         correlation=covariance / (products[:, None] * products),
         information=by_value[:, None] * by_value * (jacobian.T @ jacobian) / variance,
-        deviation=deviation,
+        deviation=deviation * unit,
         residuals=r,
-        cost=square / 2,
+        cost=square / 2 * unit**2,
         iterations=end.steps,
         offset=end.offset,
-        sensitivities=jnp.where(jnp.any(jacobian != 0, 0), found.scale, 0),
+        sensitivities=jnp.where(jnp.any(jacobian != 0, 0), found.scale, 0) * unit,
         singular_values=found.s,
         combinations=found.vt,
         in_log=jnp.asarray(in_log),

@@ -25,6 +25,11 @@ from jaxtyping import Array, Float
 from ..types import BoolScalar, IntScalar, Scalar
 
 
+# Of what is no more than so many times its round-off, nothing is known.
+ROUND_OFF = 16
+# The most Gauss–Newton steps from where the descent ends.
+POLISHED = 6
+
 Point: TypeAlias = Float[Array, " p"]
 Residual: TypeAlias = Float[Array, " m"]
 Jacobian: TypeAlias = Float[Array, "m p"]
@@ -120,11 +125,11 @@ class _LevenbergMarquardt(optimistix.AbstractGaussNewton[Point, Residual, Any]):
         inside, count = jnp.linalg.norm(seen * (u.T @ r)), jnp.sum(seen)
         outside = jnp.linalg.norm(r - u @ (seen * (u.T @ r))) / jnp.sqrt(jnp.maximum(r.size - count, 1))
         distance, noise = inside / jnp.sqrt(jnp.maximum(count, 1)), 1.0 if self.known else outside
+        size = jnp.maximum(self.magnitude, at.largest)
         # Data without noise are met up to round-off, which is in the tangent plane as much as anywhere.
-        floor = jnp.finfo(r.dtype).eps ** (2 / 3) * jnp.maximum(self.magnitude, at.largest)
-        met = (inside == 0) | (jnp.linalg.norm(r) <= floor) & (not self.known)
+        met = (inside == 0) | (jnp.linalg.norm(r) <= ROUND_OFF * jnp.finfo(r.dtype).eps * size) & (not self.known)
         offset = jnp.where(met, 0 * inside, distance / noise)
-        return offset, (offset <= self.tolerance) | (inside <= floor)
+        return offset, (offset <= self.tolerance) | (inside <= jnp.finfo(r.dtype).eps ** (2 / 3) * size)
 
 
 def minimum(
@@ -137,6 +142,9 @@ def minimum(
     steps: int,
 ) -> Minimum:
     """The minimum of |r|². `known`: whether r is in units of its noise; `magnitude`: of what r is the difference of."""
+
+    # It is traced once for the descent and for what follows it.
+    value_and_jacobian = jax.jit(value_and_jacobian)
 
     def linearised(x: Point, _: None) -> Residual:
         # J comes with r in one pass of forward directions, and is handed to whoever differentiates.
@@ -152,4 +160,24 @@ def minimum(
     found = optimistix.least_squares(linearised, method, start, max_steps=steps, throw=False)
     at: Any = found.state.descent_state
     offset, converged = method.offset(at)
-    return Minimum(found.value, at.residual, at.jacobian, found.stats["num_steps"], offset, converged)
+    steps = found.stats["num_steps"]
+
+    def unfinished(carry: Any) -> BoolScalar:
+        *_, offset, more, count = carry
+        return more & (offset > tolerance) & (count < POLISHED)
+
+    def polish(carry: Any) -> Any:
+        x, at, offset, _, count = carry
+        u, s, vt, scale = found = factors(at.jacobian)
+        step = -(vt.T @ (found.seen * (u.T @ at.residual) / jnp.where(found.seen > 0, s, 1))) / scale
+        r, jacobian = value_and_jacobian(x + step)
+        new = eqx.tree_at(lambda a: (a.residual, a.jacobian), at, (r, jacobian))
+        smaller, _ = method.offset(new)
+        better = (smaller < offset / 2) & (jnp.linalg.norm(r) <= (1 + tolerance) * jnp.linalg.norm(at.residual))
+        kept = jax.tree.map(lambda a, b: jnp.where(better, a, b), (x + step, new, smaller), (x, at, offset))
+        return *kept, better, count + 1
+
+    # What seemed round-off may be noise: whole steps tell, which lead to the minimum where the digits suffice.
+    first = (found.value, at, offset, converged, jnp.zeros_like(steps))
+    x, at, offset, _, more = jax.lax.while_loop(unfinished, polish, first)
+    return Minimum(x, at.residual, at.jacobian, steps + more, offset, converged)

@@ -79,6 +79,24 @@ def test_forward_derivatives_are_those_of_the_default_adjoint():
     np.testing.assert_allclose(forward, jax.grad(end)(0.9), rtol=1e-12)
 
 
+def test_forward_derivatives_beside_an_integer():
+    """A count in `args`, which has no tangent."""
+    wire = dae_jax.ConstrainedSystem(lambda t, q, v, a: jnp.stack([-a["g"], 0 * a["g"]]), lambda t, q, a: q[1])
+    counted = lambda t, y, a: ((y[0], -0.8 * y[1]), {**a, "n": a["n"] + 1})
+    bounce = dae_jax.Reset(lambda t, y, a, **_: y[0][0], counted, direction=False)
+
+    def end(g):
+        y0, args = (jnp.array([1.0, 0.0]), jnp.zeros(2)), {"g": g, "n": 3}
+        return dae_jax.daesolve(
+            wire, dae_jax.OrthogonalProjection(dae_jax.DOP853()), 0.0, 1.0, None, y0, args, event=bounce
+        ).ys[0][-1, 0]
+
+    # One bounce at √(2/g), with 0.8 of the speed.
+    exact = lambda g: 0.8 * jnp.sqrt(2 * g) * (1 - jnp.sqrt(2 / g)) - g / 2 * (1 - jnp.sqrt(2 / g)) ** 2
+    np.testing.assert_allclose(jax.jacfwd(end)(9.0), jax.grad(exact)(9.0), rtol=1e-9)
+    np.testing.assert_allclose(jax.hessian(end)(9.0), jax.hessian(exact)(9.0), rtol=1e-8)
+
+
 def test_batch_is_one_at_a_time():
     end = lambda e: bouncing(e, 2.2).ys[0][-1, 1]
     together = jax.vmap(lambda e: bouncing(e, 2.2, throw=False))(jnp.array([0.2, 0.8, 0.9]))

@@ -1,5 +1,6 @@
 """The plan says what was found, what is left out, and whether the loop is one kernel."""
 
+import dataclasses
 import functools
 
 import diffrax
@@ -128,11 +129,19 @@ def test_a_mesh_does_not_hinder(monkeypatch):
 
 
 def test_names_the_primitive_that_prevents_it():
-    found = plan(SCENES["four-bar-redundant"]())
+    scene = SCENES["pendulum"]()
+    weight = lambda t, q, v, args: jnp.array([0.0, -9.81]) * jnp.linalg.eigvalsh(jnp.eye(2) * (1 + q[0] ** 2))[0]
+    found = plan(dataclasses.replace(scene, system=dataclasses.replace(scene.system, force=weight)))
     assert not found.one_kernel
     assert found.hindrances == ("eigh",)
-    assert (found.constraints, found.independent) == (4, 3)
     assert "no, XLA as it is; `eigh` has no rule" in str(found)
+
+
+def test_redundant_constraints_are_one_kernel():
+    found = plan(SCENES["four-bar-redundant"]())
+    assert found.one_kernel
+    assert (found.constraints, found.independent) == (4, 3)
+    assert found.linear_solver == "dense elimination of the 3 that are independent of 4 constraints, straight-line"
 
 
 def test_switched_off():

@@ -281,11 +281,6 @@ def test_an_index_that_is_too_high_is_refused():
         solve(SCENES["integrators-4"](), 1e-6, formulation=dae_jax.Residual())
 
 
-def test_redundant_constraints_are_refused():
-    with pytest.raises(ValueError, match="redundant"):
-        solve(SCENES["four-bar-redundant"](), 1e-6)
-
-
 def test_float32():
     scene = SCENES["akzo-nobel"]()
     start = jnp.asarray(scene.y0, jnp.float32)

@@ -330,7 +330,8 @@ def test_matching_of_a_large_grid(shift):
     """Rows and columns in random order, with long augmenting paths; of one equation too many as well."""
     side, rng = 60, np.random.default_rng(0)
     line = scipy.sparse.diags_array([np.ones(side - 1), np.ones(side), np.ones(side - 1)], offsets=[-1, 0, 1])
-    grid = scipy.sparse.csr_array(scipy.sparse.kronsum(line, line))
+    own = scipy.sparse.eye_array(side)
+    grid = scipy.sparse.csr_array(scipy.sparse.kron(own, line) + scipy.sparse.kron(line, own))
     order, other = rng.permutation(side**2), rng.permutation(side**2)
     rows = variables_of(scipy.sparse.csr_array(grid[order][:, other]))
     rows = rows + [[3, 4]] * shift

@@ -104,6 +104,46 @@ def test_data_without_noise_are_met():
     assert found.offset == 0
 
 
+@pytest.mark.parametrize(
+    ("dtype", "size", "noise"),
+    [
+        (np.float32, 1e4, 0.1),
+        (np.float32, 300, 0.01),
+        (np.float64, 1.7e9, 1e-3),
+        (np.float64, 1e7, 1e-5),
+        (np.float64, 1.0, 1e-13),
+    ],
+)
+@pytest.mark.parametrize("in_log", [False, True])
+def test_noise_that_is_small_beside_the_data_is_no_round_off(dtype, size, noise, in_log):
+    """A slope on a large constant: temperatures in K, times since 1970."""
+    t = np.linspace(0, 4, 60)
+    data = np.asarray(3 * t + size + noise * RNG.normal(size=60), dtype)
+    found = dae_jax.identify(
+        lambda p: p[0] * jnp.asarray(t, dtype) + p[1], jnp.asarray([1.0, 0.9 * size], dtype), data, positive=in_log
+    )
+    design = np.stack([t, np.ones(60)], 1)
+    exact, square, *_ = np.linalg.lstsq(design, data.astype(float) - size, rcond=None)
+    error = np.sqrt(square[0] / 58 * np.linalg.inv(design.T @ design)[0, 0])
+    # A logarithm of a number loses as many of its digits as the number is large.
+    assert abs(float(found.params[0]) - exact[0]) < (0.4 if in_log and dtype == np.float32 else 0.1) * error
+    np.testing.assert_allclose(found.standard_errors[0], error, rtol=0.05)
+    np.testing.assert_allclose(found.deviation, np.sqrt(square[0] / 58), rtol=0.05)
+
+
+@pytest.mark.parametrize("unit", [1e-35, 1.6e-19, 1e-18, 1e18, 1e30])
+def test_units_of_the_data_do_not_count(unit):
+    """Squares of these are 0 or infinite in float32."""
+    t, noise = np.linspace(0, 4, 30).astype(np.float32), 1 + 0.01 * RNG.normal(size=30)
+    model = lambda unit: lambda p: p["a"] * jnp.float32(unit) * t
+    given = {"a": jnp.float32(1)}
+    plain, found = (dae_jax.identify(model(u), given, (2 * u * t * noise).astype(np.float32)) for u in (1.0, unit))
+    np.testing.assert_allclose(found.params["a"], plain.params["a"], rtol=1e-5)
+    np.testing.assert_allclose(found.standard_errors["a"], plain.standard_errors["a"], rtol=1e-3)
+    for name in ("deviation", "sensitivities"):
+        np.testing.assert_allclose(getattr(found, name), getattr(plain, name) * unit, rtol=1e-3)
+
+
 def test_units_of_the_parameters_do_not_count():
     data = decay(DECAY) + 0.05 * np.random.default_rng(2).normal(size=40)
     units = {"size": 1e6, "rate": 1e-6, "offset": 1e3}
@@ -147,9 +187,9 @@ def test_what_does_not_show_in_float32_is_told_by_its_digits():
 
 def test_noise_below_the_digits_of_the_model_is_named():
     """In the 15th digit: the descent ends at round-off, many of what would be standard errors from the minimum."""
-    data = 1e5 * decay(DECAY) + 1e-9 * np.random.default_rng(0).normal(size=40)
+    data = 1e5 * decay(DECAY) + 1e-11 * np.random.default_rng(0).normal(size=40)
     with pytest.warns(dae_jax.AccuracyWarning):
-        found = dae_jax.identify(lambda p: 1e5 * decay(p), GUESS, data, 1e-9)
+        found = dae_jax.identify(lambda p: 1e5 * decay(p), GUESS, data, 1e-11)
     assert found.offset > 1
     assert "standard errors from the minimum: the noise is too small" in found.doubts[-1]
 

@@ -28,12 +28,14 @@ METHODS = {
     "tangent-space": ("#CC79A7", ">"),
     "rattle": ("#DC0A45", "*"),
     "radau-ggl": ("#000000", "p"),
+    "radau-variable-ggl": ("#785870", "H"),
     "radau-index-2": ("#533161", "d"),
     "radau-index-3": ("#9167FF", "h"),
     "bdf-ggl": ("#5200F8", "1"),
     "dummy-derivatives": ("#1703B0", "x"),
     "state-space": ("#791037", "+"),
     "radau": ("#000000", "p"),
+    "radau-variable": ("#785870", "H"),
     "bdf": ("#5200F8", "1"),
 }
 GREY = "#999999"
