@@ -161,8 +161,10 @@ class Structure:
         if self.mechanical_degrees_of_freedom is not None:
             many = ("degree of freedom of the mechanism", "degrees of freedom of the mechanism")
             freedom = f"{counted(self.mechanical_degrees_of_freedom, *many)} ({freedom})"
+        if not self.regular:
+            freedom = f"at most {freedom}"
         lines = [
-            f"{counted(len(self.equations), 'equation')}, index {self.index}, {freedom}, "
+            f"{counted(len(self.equations), 'equation')}, index {self.index}{'' if self.regular else ' or higher'}, {freedom}, "
             f"{self._blocks_in_words}, {counted(self.nonzeros, 'nonzero')}, bandwidth {self.bandwidth}",
         ]
         if not self.regular:

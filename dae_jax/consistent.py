@@ -9,10 +9,11 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, PyTree
 
-from .equations.constraint_jacobian import mass_solve
+from .equations.constraint_jacobian import dense_mass, mass_solve
 from .equations.initial_rates import is_nonlinear, rates_of
 from .equations.linearised import LinearisedResidual
 from .equations.mechanical import MechanicalODE
+from .equations.regularity import mass_is_regular, mass_message
 from .equations.residual_form import ResidualForm
 from .equations.structural_ode import StructuralODE
 from .linalg import fixed_point, implicit_root, relative_change
@@ -175,7 +176,9 @@ def _nearest_of_mechanism(system: ConstrainedSystem, t: Time, y0: State, args: A
     ode = MechanicalODE.of(system, t, y0, args)
     q, v = ode.encode(y0)
     of_q, of_v = (jnp.where(mask, 0, 1).astype(q.dtype) for mask in ode.encode(masks))
-    y, fine, remains = _nearest(ode, jnp.asarray(t, q.dtype), (q, v), (of_q, of_v))
+    y, fine, remains, regular = _nearest(ode, jnp.asarray(t, q.dtype), (q, v), (of_q, of_v))
+    if not isinstance(regular, Tracer) and not bool(regular):
+        raise ValueError(mass_message(np.asarray(dense_mass(ode.unchecked_mass(q))), True, "at `y0`"))
     return ode.decode(t, y), fine, remains
 
 
@@ -205,9 +208,9 @@ def _nearest(ode: MechanicalODE, t: Time, y: Phase, weights: Phase) -> Any:
 
     x, _ = implicit_root(lambda x, p: x - _improved(x, p), iterate, params)
     q, v = jnp.split(x, 2)
-    remains = violation(ode, t, (q, v))
-    found = remains.consistent()
-    return jax.tree.map(lambda z: jnp.where(found, z, jnp.nan), (q, v)), found, remains
+    remains, regular = violation(ode, t, (q, v)), mass_is_regular(ode, y[0], True)
+    found = remains.consistent() & regular
+    return jax.tree.map(lambda z: jnp.where(found, z, jnp.nan), (q, v)), found, remains, regular
 
 
 def _improved(x: Float[Array, " 2n"], params: PyTree) -> Float[Array, " 2n"]:

@@ -11,18 +11,24 @@ from typing import Any, NamedTuple, overload
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from .equations.constraint_jacobian import Rank, dense_mass
 from .equations.mechanical import MechanicalODE
+from .equations.regularity import mass_is_regular, mass_message, rank_message, redundancy
 from .equations.residual_drift import EquationDrift, equation_drift
+from .equations.residual_form import bordered_multipliers
 from .solution import DAESolution, at_saved_times
 from .systems import ConstrainedSystem, ImplicitDAE, SemiExplicitDAE, System, is_mechanism
 from .types import Args, State, Time
 from .validate.captured import current
 from .validate.states import brief, refuse_wrong_state, refuse_wrong_system
 from .validate.user_functions import refuse_no_real_number, refuse_wrong_functions, returned
+
+
+HERE = "at this point"
 
 
 class Drift(NamedTuple):
@@ -100,13 +106,21 @@ def multipliers(system: ConstrainedSystem, *at: Any) -> Any:
         )
     if len(at) == 1:
         (sol,) = at
-        return _at_saved_times(system, sol, functools.partial(_multipliers, rank=sol.rank))
+        by_masses, without = (
+            functools.partial(_at_saved_times, system, sol, functools.partial(of, rank=sol.rank))
+            for of in (_multipliers, _without_inverse)
+        )
+        return _or_else(by_masses(), without)
     if len(at) not in (3, 4):
         raise TypeError("`multipliers` takes (system, sol) or (system, t, q, v, args).")
     t, q, v, *args = current(at)
     state = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), (q, v))
     refuse_wrong_state(system, state)
-    found = _multipliers(system, t, state, args[0] if args else None, system.rank)
+    at_point = t, state, args[0] if args else None
+    if not any(isinstance(x, Tracer) for x in jax.tree.leaves((system, at_point))):
+        _refuse_masses_and_rank(system, *at_point)
+    found = _multipliers(system, *at_point, system.rank)
+    found = _or_else(found, lambda: _without_inverse(system, *at_point, system.rank))
     if not isinstance(found, Tracer) and bool(jnp.any(jnp.isnan(found))):
         raise ValueError(
             "`multipliers` finds none at this point: the force or a constraint is not a number, or the constraints depend on each "
@@ -137,6 +151,37 @@ def _multipliers(
 ) -> Float[Array, " mp"]:
     ode = MechanicalODE.of(system, t, y, args, rank)
     return ode.multipliers(t, ode.encode(y))
+
+
+def _without_inverse(
+    system: ConstrainedSystem, t: Time, y: State, args: Args, rank: int | Rank | None
+) -> Float[Array, " mp"]:
+    """Those of a mechanism with massless coordinates; NaN where constraints are redundant."""
+    ode = MechanicalODE.of(system, t, y, args, rank)
+    q, v = ode.encode(y)
+    if ode.rank is not None:
+        return jnp.full(ode.holonomic + ode.nonholonomic, jnp.nan, q.dtype)
+    a, mass = ode.constraint_jacobian(t, q, v), dense_mass(ode.mass(q))
+    return bordered_multipliers(ode, t, (q, v), a, mass, jnp.ones(len(a), q.dtype))
+
+
+def _or_else(found: Array, other: Callable[[], Array]) -> Array:
+    """The numbers found, and others where they are NaN and known to be."""
+    if isinstance(found, Tracer) or not bool(jnp.any(jnp.isnan(found))):
+        return found
+    return jnp.where(jnp.isnan(found), other(), found)
+
+
+def _refuse_masses_and_rank(system: ConstrainedSystem, t: Time, y: State, args: Args) -> None:
+    ode = MechanicalODE.of(system, t, y, args)
+    flat = ode.encode(y)
+    message = None
+    if not bool(mass_is_regular(ode, flat[0], False)):
+        message = mass_message(np.asarray(dense_mass(ode.unchecked_mass(flat[0]))), False, HERE)
+    elif system.rank is not None:
+        message = rank_message(ode, redundancy(ode, t, flat), system.rank, HERE)
+    if message:
+        raise ValueError(message)
 
 
 def _at_saved_times(system: System, sol: DAESolution, of: Callable[..., Any]) -> Any:

@@ -56,8 +56,9 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "constraints, such as OrthogonalProjection, and smaller steps or tolerances; `dae_jax.drift` shows where."
     )
     no_finite_start = (
-        "The formulation has no finite starting point: the chart of `StateSpace` does not give the initial positions (it must "
-        "satisfy the constraints for every z; near a fold give `guess`), or a function is not finite at the start."
+        "The start does not determine all unknowns: the gradient of a constraint vanishes there (write the constraint itself, not "
+        "its square), equations depend on each other, a function is not finite, or the chart of `StateSpace` does not give the "
+        "initial positions (it must satisfy the constraints for every z; near a fold give `guess`)."
     )
     not_finite = (
         "The solution is not finite: the force, the mass matrix or a constraint returned NaN or infinity, a mass became "

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import optimistix
 from jax import lax
 
+from .._compat import use_stepsize_tol
 from ..equations.manifold_ode import Equations, ManifoldODE
 from ..formulations import AbstractFormulation
 from ..linalg import error_norm
@@ -68,9 +69,12 @@ def call(solve: "Solve", problem: Problem) -> tuple[Any, ...]:
     y, ode = solve.encoded(problem)
     decode = Decode(solve.formulation, solve.solver)
     solver, controller = economical(solve.solver, solve.between()), _fitted(solve.controller, t0, t1)
+    _refuse_other_tolerances(controller, y)
     if takes_residuals(solver):
         solver, controller = _of_residuals(solver, controller)
         dt0 = first_step(ode.start, solver, t0, t1, y) if dt0 is None else dt0
+    else:
+        solver = _with_tolerances_within(solver, controller)
 
     def saved(part: diffrax.SubSaveAt) -> Any:
         return part if part.fn is as_it_is else eqx.tree_at(lambda s: s.fn, part, View(part.fn, decode, args))
@@ -94,7 +98,7 @@ def call(solve: "Solve", problem: Problem) -> tuple[Any, ...]:
     saveat = dataclasses.replace(saveat, solver_state=True) if counts(solver) else saveat
     sums_errors = isinstance(controller, diffrax.ConstantStepSize) and not solve.recording
     controller = SummedErrors(controller) if sums_errors else controller
-    passage = passages(problem, ode, solve.formulation.decode, not solve.keeps()[0])
+    passage = passages(problem, ode, solve.formulation.decode, not solve.keeps()[0], solve.formulation.inverts_mass)
     controller = controller if passage is None else watched(controller, passage)
     if sums_errors or passage is not None:
         saveat = dataclasses.replace(saveat, controller_state=True)
@@ -154,6 +158,33 @@ def _fitted(controller: diffrax.AbstractStepSizeController, t0: Time, t1: Time) 
         return controller
     floor = 16 * jnp.finfo(jnp.result_type(t0)).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
     return dataclasses.replace(controller, dtmin=floor, force_dtmin=False)
+
+
+def _refuse_other_tolerances(controller: diffrax.AbstractStepSizeController, y: Y) -> None:
+    """Refuses a tolerance for each number of the state where what is integrated is another."""
+    for name in ("rtol", "atol"):
+        tolerance = getattr(controller, name, None)
+        if not isinstance(tolerance, jax.Array) or tolerance.ndim == 0:
+            continue
+        sizes = {leaf.shape for leaf in jax.tree.leaves(y)}
+        if any(tolerance.shape not in (shape, (1,)) for shape in sizes):
+            raise ValueError(
+                f"`{name}` of the step-size control has the shape {tolerance.shape}, but what this method integrates has "
+                f"{' and '.join(map(str, sorted(sizes)))}: give a number."
+            )
+
+
+def _with_tolerances_within(solver: Any, controller: diffrax.AbstractStepSizeController) -> Any:
+    """A solver around an implicit one of diffrax that takes its tolerances from the controller: diffrax looks for those of the
+    outer one only.
+    """
+    finder = getattr(getattr(solver, "solver", None), "root_finder", None)
+    open_ones = [name for name in ("rtol", "atol", "norm") if getattr(finder, name, None) is use_stepsize_tol]
+    if not open_ones or not isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
+        return solver
+    found = {name: getattr(controller, name) for name in open_ones}
+    inner = dataclasses.replace(solver.solver, root_finder=dataclasses.replace(cast(Any, finder), **found))
+    return dataclasses.replace(solver, solver=inner)
 
 
 def _of_residuals(solver: diffrax.AbstractSolver, controller: diffrax.AbstractStepSizeController) -> tuple[Any, Any]:

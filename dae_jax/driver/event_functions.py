@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..structure import dependence_patterns
 from ..types import Args, BoolLike, State, Time
 from ..validate.states import NUMBERS, brief, broadcast_to_state, describe
 from ..validate.user_functions import refuse_other_arguments, returned
@@ -23,6 +24,7 @@ def refuse_wrong_event(event: diffrax.Event | Reset | None, t: Time, y: State, a
         # A boolean that stays true is no event of which there is one.
         _refuse_wrong_condition(condition, t, y, args, "f" if isinstance(event, Reset) else "fb")
     if isinstance(event, Reset):
+        _refuse_condition_in_steps(event.condition, t, y, args)
         _refuse_wrong_reset(event, t, y, args)
 
 
@@ -36,6 +38,21 @@ def _refuse_wrong_condition(
         raise ValueError(
             "`condition(t, y, args, **kwargs)` must return a real number, whose zero is the event, but returns "
             f"{describe(found)}."
+        )
+
+
+def _refuse_condition_in_steps(condition: Callable[..., Time], t: Time, y: State, args: Args) -> None:
+    """Refuses one whose derivative is 0 wherever it exists: 1 where something holds and 0 elsewhere crosses no zero."""
+    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)), (t, y))
+    try:
+        slopes = dependence_patterns(lambda t, y: condition(t, y, args), *shapes, derivative=True)
+        values = dependence_patterns(lambda t, y: condition(t, y, args), *shapes)
+    except NotImplementedError:
+        return
+    if any(x.nnz for x in values) and not any(x.nnz for x in slopes):
+        raise ValueError(
+            "`condition(t, y, args, **kwargs)` of a Reset has steps and no slope: return what crosses zero, such as y[0] in place of "
+            "where(y[0] < 0, 1.0, 0.0)."
         )
 
 

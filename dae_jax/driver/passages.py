@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from ..equations.manifold_ode import Equations
 from ..equations.mechanical import MechanicalODE
-from ..equations.regularity import passes_singularity
+from ..equations.regularity import mass_is_regular, passes_singularity
 from ..equations.structural_ode import StructuralODE
 from ..systems import is_mechanism
 from ..types import BoolScalar, Time, Y
@@ -26,16 +26,20 @@ MOST = 32
 
 class Passage(eqx.Module):
     """Whether a step from (t₀, y₀) to (t₁, y₁) passes a configuration in which the constraints depend on each other; and, of a method
-    that `drifts`, whether the way back to the constraints may pass one.
+    that `drifts`, whether the way back to the constraints may pass one. Of a method that does without M⁻¹, also whether `masses` that
+    depend on the state have ceased to be positive.
     """
 
     ode: MechanicalODE
     decode: Callable[..., Any]
     drifts: bool = eqx.field(static=True)
+    masses: bool = eqx.field(static=True)
 
     def __call__(self, t0: Time, y0: Y, t1: Time, y1: Y, equations: Equations) -> BoolScalar:
         at = lambda t, y: self.ode.encode(self.decode(t, y, equations))
-        return passes_singularity(self.ode, t0, at(t0, y0), t1, at(t1, y1), self.drifts)
+        before, after = at(t0, y0), at(t1, y1)
+        passed = passes_singularity(self.ode, t0, before, t1, after, self.drifts)
+        return passed | ~mass_is_regular(self.ode, after[0], False) if self.masses else passed
 
 
 class Undetermined(eqx.Module):
@@ -47,7 +51,7 @@ class Undetermined(eqx.Module):
 
 
 def passages(
-    problem: Problem, ode: Equations, decode: Callable[..., Any], drifts: bool
+    problem: Problem, ode: Equations, decode: Callable[..., Any], drifts: bool, inverts_mass: bool
 ) -> Passage | Undetermined | None:
     """What sees them in the solution of a problem, by the equations that are integrated: in that of a mechanism with few
     constraints, or where the matrix of highest derivatives is not constant.
@@ -58,7 +62,8 @@ def passages(
     if not is_mechanism(system):
         return None
     ode = MechanicalODE.of(system, t, state, args, problem.rank)
-    return Passage(ode, decode, drifts) if 0 < ode.holonomic + ode.nonholonomic <= MOST else None
+    masses = callable(system.mass) and not inverts_mass
+    return Passage(ode, decode, drifts, masses) if 0 < ode.holonomic + ode.nonholonomic <= MOST else None
 
 
 def watched(controller: diffrax.AbstractStepSizeController, passage: Passage | Undetermined) -> "_AbstractWatchedSteps":

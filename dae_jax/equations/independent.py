@@ -30,9 +30,11 @@ def independent(
     assert is_mechanism(system)
     ode = MechanicalODE.of(system, t, state, args, rank)
     m = ode.holonomic
+    if ode.rank is None:
+        return dataclasses.replace(system, rank=None)
     if rows is None:
         chosen = _chosen(ode, t, ode.encode(state))
-        of_g = m if ode.rank is None else ode.rank[0]
+        of_g = ode.rank[0]
         of_h = chosen[of_g:] - m
         return _with(system, _Some.of(system.constraint, chosen[:of_g]), _Some.of(system.nonholonomic, of_h))
     of_g, of_h = tuple(i for i in rows if i < m), tuple(i - m for i in rows if i >= m)

@@ -48,7 +48,7 @@ def _is_regular(mass: Float[Array, "n n"], invertible: bool) -> Bool[Array, ""]:
     return symmetric & jnp.all(diagonal >= 0) & (smallest_pivot(scaled) > least)
 
 
-def mass_message(mass: Float[np.ndarray, "..."], invertible: bool) -> str:
+def mass_message(mass: Float[np.ndarray, "..."], invertible: bool, where: str = "at the start") -> str:
     """What is wrong with a mass matrix that is not regular."""
     least = "symmetric and positive definite" if invertible else "symmetric and positive semidefinite"
     advice = ""
@@ -69,7 +69,7 @@ def mass_message(mass: Float[np.ndarray, "..."], invertible: bool) -> str:
             " A massless coordinate that the constraints determine is for methods that do without M⁻¹: RadauIIA5() or BDF() "
             "with GGL() or Residual(...), DummyDerivatives(), or StateSpace(...)."
         )
-    return f"The mass matrix must be {least} at the start, but {what}.{advice}"
+    return f"The mass matrix must be {least} {where}, but {what}.{advice}"
 
 
 class Redundancy(eqx.Module):
@@ -155,19 +155,21 @@ def _agree_nearby(
     return agrees[0] & agrees[1]
 
 
-def rank_message(ode: MechanicalODE, found: Redundancy, given: int | Rank | None) -> str | None:
-    """What is wrong with the constraints' rank at the start; `None` where they are independent or redundant."""
+def rank_message(
+    ode: MechanicalODE, found: Redundancy, given: int | Rank | None, where: str = "at the start"
+) -> str | None:
+    """What is wrong with the constraints' rank at a state; `None` where they are independent or redundant."""
     count = ode.holonomic + ode.nonholonomic
     rank = int(found.all)
     here = (int(found.holonomic), rank) if isinstance(given, tuple) else rank
     if given is not None and given != here:
         return (
             f"`rank` says that {given} of the {count} constraints are independent, but the constraints have rank {here} of "
-            f"{count} at the start. Leave `rank` out to have it found, or correct it."
+            f"{count} {where}. Leave `rank` out to have it found, or correct it."
         )
     if rank == count:
         return None
-    stands = f"rank {rank} of {count} at the start"
+    stands = f"rank {rank} of {count} {where}"
     if not bool(found.agree):
         names = [f"constraint[{i}]" for i in range(ode.holonomic)]
         names += [f"nonholonomic[{i}]" for i in range(ode.nonholonomic)]
@@ -186,7 +188,7 @@ def rank_message(ode: MechanicalODE, found: Redundancy, given: int | Rank | None
         )
     if float(found.contradiction) > allowed_contradiction(found.contradiction.dtype):
         return (
-            f"Only {rank} of the {count} constraints are independent at the start, and the others contradict them: no "
+            f"Only {rank} of the {count} constraints are independent {where}, and the others contradict them: no "
             "acceleration satisfies all. Remove the redundant constraints or make them agree."
         )
     return None

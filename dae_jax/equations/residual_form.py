@@ -122,7 +122,7 @@ class ResidualForm(eqx.Module):
         # Where all that a constraint ties together is massless, that of the others has to do.
         masses = jnp.where(masses > 0, masses, jnp.max(masses))
         units = jax.lax.stop_gradient(jnp.where(masses > 0, masses, 1) / jnp.sqrt(squares))
-        multipliers = _multipliers(ode, t, flat, a, mass, units)
+        multipliers = bordered_multipliers(ode, t, flat, a, mass, units)
         form = dataclasses.replace(self, units=jnp.concatenate([units, units])[: self.extra])
         rest = jnp.zeros(self.extra - multipliers.size, a.dtype)
         return form, jnp.concatenate([self.layout.flatten(state), multipliers, rest])
@@ -192,7 +192,7 @@ def _weighted(mass: Float[Array, "..."] | None, x: Float[Array, "n *k"]) -> Floa
     return jnp.sum(mass * x, 1) if x.ndim < 2 else row_products(mass, x.T)
 
 
-def _multipliers(
+def bordered_multipliers(
     ode: MechanicalODE,
     t: Time,
     y: Phase,

@@ -33,6 +33,7 @@ from .derivative_orders import Combination, derivative_of, find_offsets
 from .initial_rates import is_nonlinear, rates_of
 from .manifold_ode import Feedback, ManifoldODE, at_one_instant
 from .mechanical import MechanicalODE
+from .nearest_step import step_to
 from .probe import Probe
 from .residual_form import LARGE, ResidualForm
 from .sparse_invariants import SparseInvariants
@@ -381,13 +382,7 @@ def _nearest(ode: StructuralODE, t: Time, known: Float[Array, " N"], weights: Fl
         if ode.sparse is not None:
             return ode.sparse.nearest(ode, t, y, start, weights)
         a, h = ode.normals(t, y), ode.violations(t, y)
-        largest = jnp.max(jnp.abs(a * weights), 1)
-        scale = 1 / jnp.where(largest > 0, largest, 1)
-        a, off = a * scale[:, None], scale * (h + jnp.sum(a * (start - y), 1))
-        gram = row_products(a * weights, a * weights)
-        # What the free entries cannot mend stays as it is, in place of growing without bound.
-        cut = 100 * jnp.finfo(y.dtype).eps * jnp.maximum(jnp.trace(gram), 1)
-        return start - weights**2 * jnp.sum(a * solve(gram + cut * jnp.eye(len(h), dtype=y.dtype), off)[:, None], 0)
+        return start + step_to(a, h + jnp.sum(a * (start - y), 1), weights, ode.orders.values < 0)
 
     def settled(params: PyTree, y: Float[Array, " N"], towards: Callable[[Array], Array]) -> Any:
         def correct(y: Float[Array, " N"]) -> Any:

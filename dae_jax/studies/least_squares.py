@@ -142,7 +142,6 @@ def minimum(
     steps: int,
 ) -> Minimum:
     """The minimum of |r|². `known`: whether r is in units of its noise; `magnitude`: of what r is the difference of."""
-
     # It is traced once for the descent and for what follows it.
     value_and_jacobian = jax.jit(value_and_jacobian)
 

@@ -57,12 +57,20 @@ def time_axis_advice(system: System, t: Time, state: State, args: Args) -> str:
     shapes = [jnp.shape(x) for x in jax.tree.leaves(state)]
     if not all(shapes) or len({s[0] for s in shapes}) != 1:
         return ""
+    fits = lambda state: _fits(system, t, state, args)
     one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x)[1:], jnp.result_type(x)), state)
-    try:
-        _refuse(system, t, one, args)
-    except ValueError:
+    # Functions that work number by number take vectors and numbers alike: the vectors are meant.
+    if not fits(one) or (all(len(s) == 1 for s in shapes) and fits(state)):
         return ""
     return LEADING_AXIS.format(shapes[0][0])
+
+
+def _fits(system: System, t: Time, state: State, args: Args) -> bool:
+    try:
+        _refuse(system, t, state, args)
+    except ValueError:
+        return False
+    return True
 
 
 def _refuse(system: System, t: Time, state: State, args: Args) -> None:
@@ -236,6 +244,8 @@ def _all_numbers(tree: PyTree) -> bool:
 
 def not_finite(system: System, t: Time, state: State, args: Args, when: str = "at the start") -> str:
     """Which of a system's functions are not finite at a state, in a sentence with what may be the reason; "" if all are."""
+    # Functions of the solve have seen JAX's arrays.
+    state, args = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, (state, args))
     calls = [(call.signature, call.function, call.values) for call in system.calls(t, state, args)]
     if is_mechanism(system) and callable(system.mass):
         calls.append(("mass(q, args)", system.mass, (state[0], args)))
