@@ -230,6 +230,7 @@ def _asks_for_rank(solve: Solve, problem: Problem) -> bool:
     """
     if solve.formulation.counts_constraints or (solve.needs_independent() and problem.rank is not None):
         return True
+    solve.refuse_wrong_functions(problem)
     with jax.ensure_compile_time_eval():
         return is_crowded(*problem.start)
 

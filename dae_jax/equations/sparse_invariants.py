@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..linalg.pivoted_lu import Augmented
 from ..linalg.storage import cutoff, scaling
@@ -18,6 +18,12 @@ from .compression import Compression
 
 if TYPE_CHECKING:
     from .structural_ode import StructuralODE
+
+
+# How much more derivatives may move than values, and the most.
+FREE, FREEST = 1e3, 1e15
+# An entry that is less than this part of others in its row is none, and over how many equations a weight is passed on.
+SMALL, PASSED_ON = 1e-6, 3
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -76,12 +82,30 @@ class SparseInvariants:
         """
         a, h = self.entries(ode, t, y), ode.violations(t, y)
         b = h + self.row_sums(a * (start - y)[self.columns])
+        weights = self._by_speed(a, weights, ode.orders.values < 0)
         s = a * weights[self.columns]
         scale = scaling(jnp.sqrt(self.row_sums(s * s)))
         s, b = s * scale[self.rows], b * scale
         # What the free entries cannot mend stays as it is, in place of growing without bound.
         u, _ = self._augmented.solve(s, cutoff(jnp.ones_like(h)), jnp.zeros_like(y), b)
         return start - weights * u
+
+    def _by_speed(
+        self, a: Float[Array, " entries"], weights: Float[Array, " N"], derivatives: Bool[np.ndarray, " N"]
+    ) -> Float[Array, " N"]:
+        """The weights, those of derivatives so large that in each equation a derivative moves before a value, however fast the dynamics
+        are.
+        """
+        sizes, is_rate = jnp.abs(a), derivatives[self.columns]
+        among = jax.ops.segment_max(jnp.where(is_rate, sizes, 0), self.rows, self.m)[self.rows]
+        counts = is_rate & (sizes > SMALL * among)
+        for part in (jnp.where(is_rate, 0, FREE), *[1.0] * PASSED_ON):
+            most = jax.ops.segment_max(part * sizes * weights[self.columns], self.rows, self.m)
+            needed = jnp.where(counts, most[self.rows] / jnp.where(counts, sizes, 1), 0)
+            largest = jax.ops.segment_max(needed, self.columns, len(weights))
+            raised = jnp.minimum(jnp.maximum(weights, largest), FREEST)
+            weights = jnp.where(derivatives & (weights > 0), raised, weights)
+        return weights
 
     @functools.cached_property
     def _augmented(self) -> Augmented:

@@ -36,14 +36,12 @@ from .mechanical import MechanicalODE
 from .nearest_step import step_to
 from .probe import Probe
 from .residual_form import LARGE, ResidualForm
-from .sparse_invariants import SparseInvariants
+from .sparse_invariants import FREE, SparseInvariants
 from .taylor import total_derivatives
 
 
 # Gauss–Newton's method for the derivatives of the initial state.
 STARTING = 100
-# How much more the derivatives may move there than the values: these are what is given.
-FREE = 1e3
 # A selection of states is kept until its smallest pivot is less than this part of the best one's.
 HYSTERESIS = 0.3
 # What of H may be round-off, in parts of its terms and of the resolution of numbers.

@@ -1,6 +1,7 @@
 """What a solution does with hidden constraints, multipliers at a point, and how a failure gets out of a compiled program."""
 
 import dataclasses
+import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -211,6 +212,88 @@ def test_modules_and_version_are_there_when_they_are_used():
     assert done.stdout[0].isdigit()
     with pytest.raises(AttributeError, match="no attribute 'scene'"):
         _ = dae_jax.scene
+
+
+class TestMassesAndRanks:
+    """What a solve refuses is refused at a point too."""
+
+    FALL = staticmethod(lambda t, q, v, args: jnp.array([0.0, -9.81]))
+    CIRCLE = staticmethod(lambda t, q, args: (q @ q - 1) / 2)
+    LEVEL = (jnp.array([1.0, 0.0]), jnp.zeros(2))
+
+    @pytest.mark.parametrize(
+        ("mass", "words"),
+        [
+            (jnp.array([[2.0, 0.5], [0.0, 1.0]]), r"not symmetric: mass\[0, 1\] is 0.5"),
+            (lambda q, args: jnp.array([[2.0, 0.5], [0.0, 1.0]]), "not symmetric"),
+            (jnp.array([[1.0, 2.0], [2.0, 1.0]]), "smallest eigenvalue is -1"),
+            (-jnp.ones(2), r"mass\[0\] is -1"),
+        ],
+    )
+    def test_masses(self, mass, words):
+        system = dae_jax.ConstrainedSystem(self.FALL, self.CIRCLE, mass)
+        with pytest.raises(ValueError, match=f"at this point, but.*{words}"):
+            dae_jax.multipliers(system, 0.0, *self.LEVEL)
+        with pytest.raises(ValueError, match=f"at `y0`, but.*{words}"):
+            dae_jax.consistent_state(system, 0.0, (jnp.array([1.1, 0.2]), jnp.zeros(2)))
+
+    @pytest.mark.parametrize("rank", [0, 1])
+    def test_a_rank_that_is_too_small(self, rank):
+        both = lambda t, q, args: jnp.stack([(q[:2] @ q[:2] - 1) / 2, q[2] - q[0] ** 2])
+        system = dae_jax.ConstrainedSystem(lambda t, q, v, args: jnp.array([0.0, -9.81, 0.0]), both, rank=rank)
+        with pytest.raises(ValueError, match="have rank 2 of 2 at this point"):
+            dae_jax.multipliers(system, 0.0, jnp.array([1.0, 0.0, 1.0]), jnp.zeros(3))
+
+    def test_a_massless_coordinate(self):
+        """It hangs on the constraint q₂ = q₀q₁, whose force is therefore none; that of the rod is the pendulum's."""
+        both = lambda t, q, args: jnp.stack([(q[:2] @ q[:2] - 1) / 2, q[2] - q[0] * q[1]])
+        system = dae_jax.ConstrainedSystem(
+            lambda t, q, v, args: jnp.array([0.0, -9.81, 0.0]), both, jnp.array([1.0, 1.0, 0.0])
+        )
+        sol = dae_jax.daesolve(system, dae_jax.RadauIIA5(), 0.0, 1.0, None, (jnp.array([1.0, 0.0, 0.0]), jnp.zeros(3)))
+        # λ = |v|² + g·q of a pendulum that starts level: three times the weight's part along the rod.
+        height = float(sol.final[0][1])
+        for found in (
+            dae_jax.multipliers(system, sol)[-1],
+            dae_jax.multipliers(system, 1.0, *sol.final),
+        ):
+            np.testing.assert_allclose(found, [-3 * 9.81 * height, 0.0], atol=1e-6)
+
+    def test_a_mass_that_is_negative_on_the_way(self):
+        swinging = dae_jax.ConstrainedSystem(
+            self.FALL, self.CIRCLE, lambda q, args: jnp.diag(jnp.stack([1 + 0 * q[0], 1 + 1.5 * q[1]]))
+        )
+        with pytest.warns(dae_jax.AccuracyWarning, match="a mass is negative"):
+            dae_jax.daesolve(swinging, dae_jax.RadauIIA5(), 0.0, 1.0, None, self.LEVEL)
+
+
+class TestAdvice:
+    """What is said beside an error is about that error."""
+
+    def test_vectors_are_no_time_axis(self):
+        system = dae_jax.SemiExplicitDAE(lambda t, x, z, args: -x, lambda t, x, z, args: z - x)
+        with pytest.raises(ValueError, match="is off by") as refused:
+            dae_jax.daesolve(system, dae_jax.BDF(), 0.0, 1.0, None, (jnp.ones(4), jnp.zeros(4)))
+        assert "axis" not in str(refused.value)
+
+    def test_a_function_that_needs_an_array_of_jax(self):
+        """numpy's have no `at`; the singular equations are named all the same."""
+        twice = lambda t, x, z, args: (z - x).at[0].set(z[0] + z[1] - 2 * x[0]).at[1].set(2 * (z[0] + z[1] - 2 * x[0]))
+        system = dae_jax.SemiExplicitDAE(lambda t, x, z, args: -x + z, twice)
+        with pytest.raises(RuntimeError, match="singular"):
+            dae_jax.daesolve(system, dae_jax.BDF(), 0.0, 1.0, None, (np.ones(3), np.ones(3)))
+
+    def test_tolerances_for_each_number_of_another_state(self):
+        system = dae_jax.ImplicitDAE(lambda t, y, yd, args: jnp.stack([yd[0] - y[1], y[0] - jnp.sin(t)]))
+        each = diffrax.PIDController(rtol=1e-6, atol=jnp.array([1e-6, 1e-3]))
+        solve = functools.partial(
+            dae_jax.daesolve, system, dae_jax.BDF(), 0.0, 1.0, None, jnp.array([0.0, 1.0]), stepsize_controller=each
+        )
+        with pytest.raises(
+            ValueError, match=r"`atol` of the step-size control has the shape \(2,\), but .* \(3,\): give a number"
+        ):
+            solve(formulation=dae_jax.DummyDerivatives())
+        np.testing.assert_allclose(solve(formulation=dae_jax.Residual()).final, [np.sin(1), np.cos(1)], atol=1e-3)
 
 
 def test_multipliers_at_a_point_of_redundant_constraints_need_the_rank():

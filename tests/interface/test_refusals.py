@@ -217,6 +217,7 @@ EVENTS = {
     "Event of an integer": (event(lambda t, y, a, **k: 1), "must return a real number, whose zero is the event, but returns int64[]."),
     "root finder in words": (lambda: solve(event=diffrax.Event(level, "newton")), "`root_finder` of diffrax.Event must be a root finder such as optimistix.Newton(1e-8, 1e-8), but is 'newton'."),
     "Reset without keywords": (event(lambda t, y, a: y[0][0], kept), "`condition(t, y, args, **kwargs)` must take these arguments, but the function given takes (t, y, a): write `def condition(t, y, args, **kwargs): ...`."),
+    "Reset in steps": (event(lambda t, y, a, **k: jnp.where(y[0][0] < 0, 1.0, 0.0), kept), "has steps and no slope: return what crosses zero"),
     "Reset on None": (event(lambda t, y, a, **k: None, kept), "must return a real number, whose zero is the event, but returns None."),
     "jump to y alone": (event(level, lambda t, y, a: y), "`reset(t, y, args)` must return (y, args), the state and the args to go on with, ((float64[2], float64[2]), None), but returns (float64[2], float64[2])."),
     "jump to None": (event(level, lambda t, y, a: None), "`reset(t, y, args)` must return (y, args)"),

@@ -170,3 +170,16 @@ def test_backwards_in_time_with_a_constraint_that_depends_on_time(solver):
     exact = scene.reference(times)
     np.testing.assert_allclose(sol.ys[0], exact[0], atol=1e-6)
     assert dae_jax.drift(scene.system, sol).position.max() < 1e-13
+
+
+def test_an_implicit_method_of_diffrax_is_projected():
+    """Its tolerances are those of the controller, which diffrax hands to a solver that stands alone only."""
+    scene = pendulum()
+    times = np.linspace(0, 1, 11)
+    for tolerance, error in ((1e-5, 1e-3), (1e-8, 1e-6)):
+        sol = dae_jax.daesolve(
+            scene.system, dae_jax.OrthogonalProjection(diffrax.Kvaerno5()), 0.0, 1.0, None, scene.y0, scene.args,
+            saveat=diffrax.SaveAt(ts=jnp.asarray(times)), stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
+        )  # fmt: skip
+        assert scene.error(times, sol.ys) < error
+        assert float(dae_jax.drift(scene.system, sol).position.max()) < 1e-14
