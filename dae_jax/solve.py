@@ -39,6 +39,8 @@ from .validate.user_functions import not_finite, refuse_wrong_functions
 
 
 _of_known_rank: dict[Program, Program] = {}
+# Programs, by their hashes, whose constraints are fewer than their coordinates.
+_with_few: set[int] = set()
 
 
 def daesolve(
@@ -68,10 +70,12 @@ def daesolve(
       looked at in each call, and a change is seen, also one of an object in `args`; only containers of more than 2,000 containers or
       objects that are changed in place are not looked into, nor objects of other libraries. Hand over as `args` what changes often,
       as numbers and arrays: that compiles nothing anew.
-    - `solver`: any diffrax solver, or one that keeps its steps on the constraints (`OrthogonalProjection`,
-      `SymmetricProjection`, `TangentSpace`, `RATTLE`).
-    - `t0`, `t1`, `dt0`: start, end and first (or fixed) step; t1 < t0 integrates backwards, with dt0 < 0.
-    - `y0`: the state at `t0`: (q, v), (x, z) or y, as the system has it; must satisfy the equations, also the hidden ones.
+    - `solver`: any diffrax solver, one that keeps its steps on the constraints (`OrthogonalProjection`,
+      `SymmetricProjection`, `TangentSpace`, `RATTLE`), or one of 0 = F(t, y, ẏ) (`RadauIIA5`, `Radau`, `BDF`).
+    - `t0`, `t1`, `dt0`: start, end and first (or fixed) step; t1 < t0 integrates backwards, with dt0 < 0. Where t1 = t0 the
+      derivatives by them are 0.
+    - `y0`: the state at `t0`: (q, v), (x, z) or y, as the system has it; must satisfy the equations, also the hidden ones. The
+      derivative by it has a meaning along these; across them, where no solution starts, it is another for each method.
     - `args`: handed to the system's functions.
     - `yd0`: ẏ at the start, or near it, in the structure of `y0`: for an `ImplicitDAE` that is nonlinear in ẏ. With more than 256
       unknowns ẏ is looked for from there only, and that several ẏ satisfy the equations is not seen.
@@ -91,7 +95,7 @@ def daesolve(
     fails, or a `RESULTS` code with `throw=False`. An `AccuracyWarning` where it does not fail, but the answer is doubtful: it has
     drifted off the constraints by more than a thousand tolerances, fixed steps are too large for the motion, a million steps may
     add up their errors, or it has passed a configuration in which the constraints depend on each other (seen with up to 32 of
-    them); in a batch or under `jit` `stats["doubts"]` says so, by bits 1, 2, 4 and 8.
+    them) or a mass is negative; in a batch or under `jit` `stats["doubts"]` says so, by bits 1, 2, 4 and 8.
     """
     solve, problem = prepared(
         with_rates(system, yd0, y0), solver, t0, t1, dt0, y0, args, formulation, saveat, stepsize_controller, adjoint, event,
@@ -201,7 +205,7 @@ def _run_on_numbers(program: Program, arrays: Arrays, solve: Solve, problem: Pro
     """
     known = _of_known_rank.get(program)
     if known is None:
-        known = _with_rank(program, solve, problem) if _asks_for_rank(solve, problem) else _remembered(program, program)
+        known = _with_rank(program, solve, problem) if _asks_for_rank(program, solve, problem) else program
     sol, as_expected, seconds = run(known, arrays)
     # Inside an outer `jit` the result is no number, although the inputs are: they are looked at each time it is traced.
     inside = isinstance(as_expected, Tracer)
@@ -221,25 +225,26 @@ def _with_rank(program: Program, solve: Solve, problem: Problem) -> Program:
         rank = refuse_bad_start(*problem.start, solve.formulation.inverts_mass)
         rows = rows_of(*problem.start, rank) if rank is not None and solve.needs_independent() else None
     better, _ = split((solve, dataclasses.replace(problem, rank=rank, rows=rows)))
-    return _remembered(program, better)
+    _of_known_rank[program] = better
+    for oldest in list(_of_known_rank)[:-KEPT]:
+        _of_known_rank.pop(oldest, None)
+    return better
 
 
-def _asks_for_rank(solve: Solve, problem: Problem) -> bool:
+def _asks_for_rank(program: Program, solve: Solve, problem: Problem) -> bool:
     """Whether to look at a start before anything is compiled: where constraints are as many as coordinates, some are redundant or
     nothing moves.
     """
     if solve.formulation.counts_constraints or (solve.needs_independent() and problem.rank is not None):
         return True
+    if not is_mechanism(problem.system) or hash(program) in _with_few:
+        return False
     solve.refuse_wrong_functions(problem)
     with jax.ensure_compile_time_eval():
-        return is_crowded(*problem.start)
-
-
-def _remembered(program: Program, better: Program) -> Program:
-    _of_known_rank[program] = better
-    for oldest in list(_of_known_rank)[:-KEPT]:
-        _of_known_rank.pop(oldest, None)
-    return better
+        crowded = is_crowded(*problem.start)
+    if not crowded:
+        _with_few.add(hash(program))
+    return crowded
 
 
 def _is_real(x: object) -> bool:

@@ -63,8 +63,7 @@ def _rows_of(system: ConstrainedSystem, t: Time, state: State, args: Args, rank:
 
 def is_crowded(system: System, t: Time, state: State, args: Args) -> bool:
     """Whether a mechanism has at least as many constraints as coordinates."""
-    if not is_mechanism(system):
-        return False
+    assert is_mechanism(system)
     q, v = state
     g, h = system.constraint, system.nonholonomic
     found = jax.eval_shape(lambda: (g and g(t, q, args), h and h(t, q, v, args)))
