@@ -48,16 +48,14 @@ class DenseNormals:
     nonholonomic: int
     rank: Rank | None
 
-    def at(
-        self, ode: Mechanism, t: Time, q: Flat, v: Flat
-    ) -> tuple[Float[Array, "c n"], Float[Array, "n c"], Float[Array, " c"] | None]:
+    def at(self, ode: Mechanism, t: Time, q: Flat, v: Flat) -> tuple[Array, ...]:
         """A and M⁻¹Aᵀ, the normals in the metric of the mass matrix; and where some constraints depend on others 1 for each of as
         many as are independent, 0 for the others.
         """
         a = ode.constraint_jacobian(t, q, v)
         n = mass_solve(ode.mass(q), a.T)
         if self.rank is None:
-            return a, n, None
+            return a, n
         gram = _matmul(a, n)
         scale = unit_diagonal(gram)
         counts = (self.holonomic, self.rank[0]), (len(a), self.rank[1])
@@ -73,17 +71,18 @@ class DenseNormals:
 
     def gram_solve(self, ode: Mechanism, normals: Normals, b: Float[Array, " c"]) -> Float[Array, " c"]:
         """x with A M⁻¹Aᵀ x = b, of the first constraints where b is shorter; 0 where constraints depend on others."""
-        gram = self._gram(normals, b.shape[0])
-        if normals[2] is None:
+        a, n = normals[0][: b.shape[0]], normals[1][:, : b.shape[0]]
+        gram = _matmul(a, n)
+        if self.rank is None:
             return semidefinite_solve(gram, b)
         kept = self.independent(normals)[: b.shape[0]]
         return kept * semidefinite_solve(of_rows(gram, kept), kept * b)
 
     def least_norm(self, ode: Mechanism, normals: Normals, b: Float[Array, " c"]) -> Float[Array, " c"]:
         """The shortest such x, of b that satisfies all constraints."""
-        gram = self._gram(normals, b.shape[0])
         if self.rank is None:
-            return semidefinite_solve(gram, b)
+            return self.gram_solve(ode, normals, b)
+        gram = _matmul(*normals[:2])
         # Which constraints depend on each other has nothing to do with their scale.
         scale = unit_diagonal(gram)
         return scale * semidefinite_solve(gram * scale[:, None] * scale, scale * b, self.rank[1])
@@ -92,10 +91,6 @@ class DenseNormals:
     def independent(normals: Normals) -> Float[Array, " c"]:
         """1 for each of as many constraints as are independent, where some depend on others."""
         return normals[2]
-
-    @staticmethod
-    def _gram(normals: Normals, rows: int) -> Float[Array, "c c"]:
-        return _matmul(normals[0][:rows], normals[1][:, :rows])
 
     def lengths(self, ode: Mechanism, normals: Normals) -> Float[Array, " c"]:
         """The length of each row of A."""

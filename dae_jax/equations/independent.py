@@ -33,10 +33,10 @@ def independent(
     if ode.rank is None:
         return dataclasses.replace(system, rank=None)
     if rows is None:
-        chosen = _chosen(ode, t, ode.encode(state))
-        of_g = ode.rank[0]
-        of_h = chosen[of_g:] - m
-        return _with(system, _Some.of(system.constraint, chosen[:of_g]), _Some.of(system.nonholonomic, of_h))
+        y, of_g = ode.encode(state), ode.rank[0]
+        chosen = (_chosen(ode, t, y)[:, None] == jnp.arange(m + ode.nonholonomic)).astype(y[0].dtype)
+        g, h = chosen[:of_g, :m], chosen[of_g:, m:]
+        return _with(system, _Some.of(system.constraint, g), _Some.of(system.nonholonomic, h))
     of_g, of_h = tuple(i for i in rows if i < m), tuple(i - m for i in rows if i >= m)
     return _with(system, _Some.of(system.constraint, of_g), _Some.of(system.nonholonomic, of_h))
 
@@ -75,18 +75,18 @@ def _with(system: ConstrainedSystem, g: "_Some | None", h: "_Some | None") -> Co
 
 
 class _Some(eqx.Module):
-    """Some of a function's values: `fixed` ones, whose pattern is known, or those of an array."""
+    """Some of a function's values: `fixed` ones, whose pattern is known, or those of rows of the unit matrix."""
 
     function: Callable[..., Any]
-    rows: Int[Array, " k"] | None
+    rows: Float[Array, "k m"] | None
     fixed: Rows | None = eqx.field(static=True)
 
     @classmethod
-    def of(cls, function: Callable[..., Any] | None, rows: Rows | Int[Array, " k"]) -> "_Some | None":
+    def of(cls, function: Callable[..., Any] | None, rows: Rows | Float[Array, "k m"]) -> "_Some | None":
         if function is None or not len(rows):
             return None
         return cls(function, None, rows) if isinstance(rows, tuple) else cls(function, rows, None)
 
     def __call__(self, *at: Any) -> Float[Array, " k"]:
         values = jnp.ravel(self.function(*at))
-        return values[np.array(self.fixed)] if self.rows is None else values[self.rows]
+        return values[np.array(self.fixed)] if self.rows is None else jnp.sum(self.rows * values, 1)

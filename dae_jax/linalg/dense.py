@@ -51,7 +51,8 @@ def determinant_sign(a: Float[Array, "n n"]) -> Float[Array, ""]:
 
 def minor_sign(a: Float[Array, "n n"], rank: int) -> Float[Array, ""]:
     """The sign of the largest principal minor of so many rows, about: the product of the pivots that are the largest on the
-    diagonal. Of A near S, symmetric, positive semidefinite and of that rank, it is that of det A on the range of S.
+    diagonal. Of A near S, symmetric, positive semidefinite and of that rank, it is that of det A on the range of S. Positive pivots come
+    first: a row that has changed its sign alone, and that depends on others, has not turned that range.
     """
     if rank == len(a) <= 2:
         return jnp.sign(a[0, 0] if rank == 1 else a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0])
@@ -59,7 +60,7 @@ def minor_sign(a: Float[Array, "n n"], rank: int) -> Float[Array, ""]:
     def eliminate(_: IntScalar, carry: tuple[Float[Array, "n n"], Float[Array, ""]]):
         a, sign = carry
         diagonal = jnp.sum(a * jnp.eye(len(a), dtype=a.dtype), 1)
-        here = jnp.arange(len(a)) == jnp.argmax(jnp.abs(diagonal))
+        here = jnp.arange(len(a)) == jnp.argmax(jnp.where(diagonal > 0, diagonal, -diagonal / 10))
         pivot = jnp.sum(jnp.where(here, diagonal, 0))
         row, column = (jnp.sum(jnp.where(x, a, 0), k, keepdims=True) for k, x in enumerate((here[:, None], here)))
         left = jnp.where(here | here[:, None], 0, a - column * row / jnp.where(pivot == 0, 1, pivot))

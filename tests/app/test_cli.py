@@ -141,7 +141,7 @@ WRONG = {
     "compare pendulum --methods magic": "unknown method 'magic'; pendulum knows differentiation",
     "compare pendulum --methods rattle,": "unknown method ''; pendulum knows differentiation",
     "compare pendulum --methods=": "unknown method ''; pendulum knows differentiation",
-    "compare robertson --methods rattle": "unknown method 'rattle'; robertson knows radau, bdf",
+    "compare robertson --methods rattle": "unknown method 'rattle'; robertson knows radau, radau-variable, bdf",
     "compare pendulum --t1 -1": "--t1 must be positive and finite, but is -1.0",
     "compare pendulum --t1 inf": "--t1 must be positive",
     "compare pendulum --t1 nan": "--t1 must be positive",
@@ -329,7 +329,7 @@ def test_interrupted_comparison_keeps_what_is_finished(tmp_path):
     with (tmp_path / "table.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert rows[0]["method"] == "differentiation"
-    assert last == f"dae-jax: interrupted; {len(rows)} of 16 methods are done and kept in {tmp_path}"
+    assert last == f"dae-jax: interrupted; {len(rows)} of 17 methods are done and kept in {tmp_path}"
 
 
 def test_interrupted_descent_keeps_its_history(monkeypatch, tmp_path, capsys):
