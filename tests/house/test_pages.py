@@ -120,7 +120,7 @@ class TestWhichMethod:
             assert rows == list(methods(dae_jax.scenes.SCENES[name]())), "run `python notebooks/which_method/write.py`"
 
     def test_a_table_is_what_is_measured(self):
-        """Robertson's, whose two solves are short: steps and errors are those of the page."""
+        """Robertson's, whose three solves are short: steps and errors are those of the page."""
         kept, found = (
             re.findall(r"^\| `([\w-]+)` \| (\d+) \|.*?\|.*?\| (\S+) \|", table, re.MULTILINE)
             for table in (
@@ -128,7 +128,7 @@ class TestWhichMethod:
                 writer("which_method").table("robertson"),
             )
         )
-        assert len(kept) == len(found) == 2
+        assert len(kept) == len(found) == 3
         for (name, steps, error), (method, count, off) in zip(kept, found, strict=True):
             assert method == name
             assert int(count) == pytest.approx(int(steps), rel=0.05)
