@@ -22,7 +22,7 @@ from .equations.residual_drift import EquationDrift, equation_drift
 from .equations.residual_form import bordered_multipliers
 from .solution import DAESolution, at_saved_times
 from .systems import ConstrainedSystem, ImplicitDAE, SemiExplicitDAE, System, is_mechanism
-from .types import Args, State, Time
+from .types import Args, Phase, State, Time
 from .validate.captured import current
 from .validate.states import brief, refuse_wrong_state, refuse_wrong_system
 from .validate.user_functions import refuse_no_real_number, refuse_wrong_functions, returned
@@ -106,21 +106,18 @@ def multipliers(system: ConstrainedSystem, *at: Any) -> Any:
         )
     if len(at) == 1:
         (sol,) = at
-        by_masses, without = (
-            functools.partial(_at_saved_times, system, sol, functools.partial(of, rank=sol.rank))
-            for of in (_multipliers, _without_inverse)
-        )
-        return _or_else(by_masses(), without)
+        of = lambda find: _at_saved_times(system, sol, functools.partial(_by_ode, find, rank=sol.rank))
+        return _or_else(of(MechanicalODE.multipliers), lambda: of(_without_inverse))
     if len(at) not in (3, 4):
         raise TypeError("`multipliers` takes (system, sol) or (system, t, q, v, args).")
     t, q, v, *args = current(at)
     state = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), (q, v))
     refuse_wrong_state(system, state)
-    at_point = t, state, args[0] if args else None
-    if not any(isinstance(x, Tracer) for x in jax.tree.leaves((system, at_point))):
-        _refuse_masses_and_rank(system, *at_point)
-    found = _multipliers(system, *at_point, system.rank)
-    found = _or_else(found, lambda: _without_inverse(system, *at_point, system.rank))
+    ode = MechanicalODE.of(system, t, state, args[0] if args else None)
+    y = ode.encode(state)
+    if not any(isinstance(x, Tracer) for x in jax.tree.leaves((ode, t, y))):
+        _refuse_masses_and_rank(ode, t, y)
+    found = _or_else(ode.multipliers(t, y), lambda: _without_inverse(ode, t, y))
     if not isinstance(found, Tracer) and bool(jnp.any(jnp.isnan(found))):
         raise ValueError(
             "`multipliers` finds none at this point: the force or a constraint is not a number, or the constraints depend on each "
@@ -146,19 +143,16 @@ def _energy(system: ConstrainedSystem, t: Time, y: State, args: Args) -> Any:
     return jnp.dot(flat_v, momentum) / 2 + potential(y[0], args)
 
 
-def _multipliers(
-    system: ConstrainedSystem, t: Time, y: State, args: Args, rank: int | Rank | None
+def _by_ode(
+    find: Callable[..., Any], system: ConstrainedSystem, t: Time, y: State, args: Args, rank: int | Rank | None
 ) -> Float[Array, " mp"]:
     ode = MechanicalODE.of(system, t, y, args, rank)
-    return ode.multipliers(t, ode.encode(y))
+    return find(ode, t, ode.encode(y))
 
 
-def _without_inverse(
-    system: ConstrainedSystem, t: Time, y: State, args: Args, rank: int | Rank | None
-) -> Float[Array, " mp"]:
+def _without_inverse(ode: MechanicalODE, t: Time, y: Phase) -> Float[Array, " mp"]:
     """Those of a mechanism with massless coordinates; NaN where constraints are redundant."""
-    ode = MechanicalODE.of(system, t, y, args, rank)
-    q, v = ode.encode(y)
+    q, v = y
     if ode.rank is not None:
         return jnp.full(ode.holonomic + ode.nonholonomic, jnp.nan, q.dtype)
     a, mass = ode.constraint_jacobian(t, q, v), dense_mass(ode.mass(q))
@@ -172,14 +166,12 @@ def _or_else(found: Array, other: Callable[[], Array]) -> Array:
     return jnp.where(jnp.isnan(found), other(), found)
 
 
-def _refuse_masses_and_rank(system: ConstrainedSystem, t: Time, y: State, args: Args) -> None:
-    ode = MechanicalODE.of(system, t, y, args)
-    flat = ode.encode(y)
-    message = None
-    if not bool(mass_is_regular(ode, flat[0], False)):
-        message = mass_message(np.asarray(dense_mass(ode.unchecked_mass(flat[0]))), False, HERE)
-    elif system.rank is not None:
-        message = rank_message(ode, redundancy(ode, t, flat), system.rank, HERE)
+def _refuse_masses_and_rank(ode: MechanicalODE, t: Time, y: Phase) -> None:
+    message, given = None, ode.system.rank
+    if not bool(mass_is_regular(ode, y[0], False)):
+        message = mass_message(np.asarray(dense_mass(ode.unchecked_mass(y[0]))), False, HERE)
+    elif given is not None:
+        message = rank_message(ode, redundancy(ode, t, y), given, HERE)
     if message:
         raise ValueError(message)
 

@@ -33,7 +33,7 @@ from .solution import RESULTS, DAESolution
 from .solvers import AbstractResidualSolver, SelectedResiduals, SelectedStates, takes_residuals
 from .systems import System, is_mechanism
 from .types import Args, Controller, DType, ProgressMeter, Solver, State, Time
-from .validate.captured import current, settle
+from .validate.captured import REMEMBERED, current, settle
 from .validate.states import with_rates
 from .validate.user_functions import not_finite, refuse_wrong_functions
 
@@ -243,6 +243,8 @@ def _asks_for_rank(program: Program, solve: Solve, problem: Problem) -> bool:
     with jax.ensure_compile_time_eval():
         crowded = is_crowded(*problem.start)
     if not crowded:
+        if len(_with_few) >= REMEMBERED:
+            _with_few.clear()
         _with_few.add(hash(program))
     return crowded
 

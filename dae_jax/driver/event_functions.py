@@ -44,12 +44,12 @@ def _refuse_wrong_condition(
 def _refuse_condition_in_steps(condition: Callable[..., Time], t: Time, y: State, args: Args) -> None:
     """Refuses one whose derivative is 0 wherever it exists: 1 where something holds and 0 elsewhere crosses no zero."""
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)), (t, y))
+    depends = lambda **how: any(x.nnz for x in dependence_patterns(lambda t, y: condition(t, y, args), *shapes, **how))
     try:
-        slopes = dependence_patterns(lambda t, y: condition(t, y, args), *shapes, derivative=True)
-        values = dependence_patterns(lambda t, y: condition(t, y, args), *shapes)
+        in_steps = not depends(derivative=True) and depends()
     except NotImplementedError:
         return
-    if any(x.nnz for x in values) and not any(x.nnz for x in slopes):
+    if in_steps:
         raise ValueError(
             "`condition(t, y, args, **kwargs)` of a Reset has steps and no slope: return what crosses zero, such as y[0] in place of "
             "where(y[0] < 0, 1.0, 0.0)."

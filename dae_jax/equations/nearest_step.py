@@ -19,9 +19,9 @@ def step_to(
     """
     eps, m = jnp.finfo(off.dtype).eps, len(off)
     free = derivatives & (weights > 0)
-    own, largest = jnp.where(free, 1.0, weights), lambda x: jnp.max(jnp.abs(x), 1, initial=0)
+    largest = lambda x: jnp.max(jnp.abs(x), 1, initial=0)
     by_derivatives = largest(jnp.where(free, a, 0))
-    size = jnp.where(by_derivatives > 0, by_derivatives, largest(a * own))
+    size = jnp.where(by_derivatives > 0, by_derivatives, largest(a * weights))
     scale = 1 / jnp.where(size > 0, size, 1)
     columns = jnp.arange(a.shape[1])
 
@@ -52,5 +52,4 @@ def step_to(
     gram = row_products(rest, rest)
     cut = 100 * eps * jnp.maximum(jnp.trace(gram), 1)
     values = -weights * jnp.sum(rest * solve(gram + cut * jnp.eye(m, dtype=a.dtype), scale * off)[:, None], 0)
-    values = jnp.where(free, 0, values)
-    return values - jnp.sum(pivots * (solved * (off + jnp.sum(a * values, 1)))[:, None], 0)
+    return values - jnp.sum(pivots * (off + jnp.sum(a * values, 1))[:, None], 0)
