@@ -42,10 +42,15 @@ def scan_counts(params: Params) -> tuple[int, int]:
 
 def is_check(eqn: Equation) -> bool:
     """Whether an equation is the call that raises in `equinox.error_if`."""
-    if eqn.primitive.name != "pure_callback":
-        return False
-    callback = getattr(eqn.params["callback"], "callback_func", None)
-    return getattr(callback, "__module__", None) == "equinox._errors"
+    return (
+        eqn.primitive.name == "pure_callback"
+        and getattr(callback_function(eqn), "__module__", None) == "equinox._errors"
+    )
+
+
+def callback_function(eqn: Equation) -> Any:
+    """The function of a `pure_callback`."""
+    return getattr(eqn.params["callback"], "callback_func", None)
 
 
 def is_key(aval: Aval) -> bool:

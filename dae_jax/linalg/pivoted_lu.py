@@ -5,7 +5,7 @@ Each call is a function of numbers alone; that the same matrix has been factoris
 
 import dataclasses
 import functools
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -40,16 +40,25 @@ class PivotedLU:
         self, a: Inexact[Array, " entries"], b: Inexact[Array, " n"], needed: Bool[Array, ""], transposed: bool = False
     ) -> Inexact[Array, " n"]:
         """x with A x = b, or Aᵀ x = b, where that is `needed`; without a derivative."""
-        dtype = jnp.result_type(a, b)
+        found = jax.ShapeDtypeStruct(b.shape, jnp.result_type(a, b))
+        return jax.pure_callback(_OnHost(self, transposed), found, a, b, needed, vmap_method="sequential")
 
-        def on_host(a: Any, b: Any, needed: Any) -> np.ndarray:
-            return (
-                _remembered(self, *_key(a)).solve(np.asarray(b, dtype), transposed)
-                if needed
-                else np.zeros(b.shape, dtype)
-            )
 
-        return jax.pure_callback(on_host, jax.ShapeDtypeStruct(b.shape, dtype), a, b, needed, vmap_method="sequential")
+@dataclasses.dataclass(frozen=True)
+class _OnHost:
+    """x with A x = b, or Aᵀ x = b, where that is `needed`."""
+
+    pattern: PivotedLU
+    transposed: bool
+
+    # So that it may be called from within a kernel.
+    never_raises: ClassVar[bool] = True
+
+    def __call__(self, a: Any, b: Any, needed: Any) -> np.ndarray:
+        dtype = np.result_type(a.dtype, b.dtype)
+        if not needed:
+            return np.zeros(b.shape, dtype)
+        return _remembered(self.pattern, *_key(a)).solve(np.asarray(b, dtype), self.transposed)
 
 
 @dataclasses.dataclass(frozen=True)

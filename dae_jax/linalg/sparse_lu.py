@@ -5,6 +5,7 @@ Row after row, in a vector of work: row i less L[i, k] times row k of U, for the
 Source: I. S. Duff, A. M. Erisman, J. K. Reid, *Direct Methods for Sparse Matrices*, 2nd ed., section 10.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -66,7 +67,7 @@ def eliminated(a: Inexact[Array, " entries"], k: SymbolicLU) -> Factors:
 
     n = k.rows.shape[0]
     begin = jnp.zeros(k.at.shape, a.dtype), jnp.zeros(n, a.dtype), jnp.zeros(n, real), zero
-    lu, _, scale, largest = lax.fori_loop(0, n, row, begin)
+    lu, _, scale, largest = _for_each_row(n, row, begin)
     return Factors(lu, scale, largest)
 
 
@@ -89,8 +90,8 @@ def solved(factors: Factors, b: Inexact[Array, " n"], k: SymbolicLU) -> Inexact[
         return _set(x, i, value), _set(out, _get(k.columns, i), value)
 
     nothing = jnp.zeros(n, jnp.result_type(lu, b))
-    x = lax.fori_loop(0, n, forward, nothing)
-    return lax.fori_loop(0, n, backward, (x, nothing))[1]
+    x = _for_each_row(n, forward, nothing)
+    return _for_each_row(n, backward, (x, nothing))[1]
 
 
 @jit
@@ -115,12 +116,16 @@ def solved_transposed(factors: Factors, b: Inexact[Array, " n"], k: SymbolicLU) 
         )
 
     nothing = jnp.zeros(n, jnp.result_type(lu, b))
-    x = lax.fori_loop(0, n, lambda i, x: _set(x, i, _get(b, _get(k.columns, i)).astype(x.dtype)), nothing)
-    x = lax.fori_loop(0, n, forward, x)
-    return lax.fori_loop(0, n, backward, (x, nothing))[1]
+    x = _for_each_row(n, lambda i, x: _set(x, i, _get(b, _get(k.columns, i)).astype(x.dtype)), nothing)
+    x = _for_each_row(n, forward, x)
+    return _for_each_row(n, backward, (x, nothing))[1]
 
 
-# Every index is in bounds: a check of each would cost a quarter of the time.
+def _for_each_row(n: int, step: Callable[[IntScalar, PyTree], PyTree], begin: PyTree) -> PyTree:
+    return lax.fori_loop(jnp.uint32(0), jnp.uint32(n), step, begin)
+
+
+# Every index is in bounds, and none is negative, so that there is nothing to count from the end: checks would take half of the time.
 
 
 def _get(x: PyTree, i: IntScalar) -> Any:

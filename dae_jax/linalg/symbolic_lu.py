@@ -87,4 +87,4 @@ def symbolic_lu(
         given,
         at_column[given],
     )
-    return SymbolicLU(*(x.astype(np.int32) for x in indices))
+    return SymbolicLU(*(x.astype(np.uint32) for x in indices))

@@ -129,7 +129,7 @@ class TestObjectCodeOnDisk:
         assert key("other") != first
         assert key(passes=False) != first
         for owner, name, value in (
-            (object_code, "SPEED", 3), (object_code, "BY_VECTORS", (True, True)), (object_code, "HEAVY", 1),
+            (object_code, "SPEED", 3), (object_code, "TUNING", {}), (object_code, "HEAVY", 1),
             (object_code, "VERSION", (0, 4)), (object_code.importlib.metadata, "version", lambda _: "9.9"),
         ):  # fmt: skip
             with monkeypatch.context() as patch:

@@ -15,7 +15,7 @@ import jax
 from jaxtyping import Array
 
 from ..settings import THREADS, current
-from . import object_cache
+from . import host_functions, object_cache
 from .object_code import key, object_code, parsed
 from .runtime import HANDLE, SHARE, STUBS, stubs, text as shared
 from .target import Target, host, llvm
@@ -127,6 +127,7 @@ class Runtime:
         address = self.engine.get_function_address
         for name in (HANDLE, SHARE):
             llvm().add_symbol(name, address(name))
+        llvm().add_symbol(host_functions.HOST, ctypes.cast(host_functions.run, ctypes.c_void_p).value)
         self.fill = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(address("fill"))
         self.release = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p)(address("release"))
         self.clock = ctypes.c_int64.from_address(self.engine.get_global_value_address("clock"))

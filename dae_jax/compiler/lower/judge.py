@@ -43,13 +43,13 @@ def unsupported(
         return ()
     if judged.primitive == "size":
         return (judged,)
-    return tuple(_unsupported(inlined(without_keys(jaxpr)), inlined)) or (judged,)
+    return tuple(_unsupported(inlined(without_keys(jaxpr)), inlined, target)) or (judged,)
 
 
 @functools.lru_cache(maxsize=4)
 def _annotated(jaxpr: ClosedJaxpr, batched: tuple[bool, ...], target: Target) -> Annotated | Unsupported:
     whole, inlined = without_keys(jaxpr), Inlining()
-    found = next(_unsupported(inlined(whole), inlined), None)
+    found = next(_unsupported(inlined(whole), inlined, target), None)
     if found is not None:
         return found
     annotated = estimate.annotated(inlined(whole), batched, inlined, target)
@@ -60,32 +60,36 @@ def _annotated(jaxpr: ClosedJaxpr, batched: tuple[bool, ...], target: Target) ->
     return _unless_too_large(annotated)
 
 
-def _unsupported(jaxpr: ClosedJaxpr, inlined: Inlining) -> Iterator[Unsupported]:
+def _unsupported(jaxpr: ClosedJaxpr, inlined: Inlining, target: Target | None) -> Iterator[Unsupported]:
     for v in (*jaxpr.jaxpr.invars, *jaxpr.jaxpr.outvars):
         if named(v.aval) not in ALL:
             yield Unsupported(
                 f"{named(v.aval)} is no type of number that is compiled", primitive="convert_element_type"
             )
-    yield from _unsupported_within(jaxpr, inlined)
+    yield from _unsupported_within(jaxpr, inlined, target)
 
 
-def _unsupported_within(jaxpr: ClosedJaxpr, inlined: Inlining) -> Iterator[Unsupported]:
+def _unsupported_within(jaxpr: ClosedJaxpr, inlined: Inlining, target: Target | None) -> Iterator[Unsupported]:
     if any(isinstance(x, Tracer) for x in jaxpr.consts):
         yield Unsupported("a constant is being traced", primitive="constant")
     for eqn in jaxpr.jaxpr.eqns:
-        reason = _reason(eqn)
+        reason = _reason(eqn, target)
         if reason:
             yield Unsupported(reason, quoted(eqn), eqn.primitive.name)
         elif RULES[eqn.primitive.name].nested:
             for body in inner(eqn):
-                yield from _unsupported_within(inlined(body), inlined)
+                yield from _unsupported_within(inlined(body), inlined, target)
 
 
-def _reason(eqn: Equation) -> str | None:
+def _reason(eqn: Equation, target: Target | None) -> str | None:
     name = eqn.primitive.name
     if eqn.effects:
         return f"`{name}` has side effects"
-    return RULES[name].unsupported(eqn) if name in RULES else f"`{name}` has no rule"
+    if name not in RULES:
+        return f"`{name}` has no rule"
+    if RULES[name].on_host and target is not None and target.threads:
+        return f"`{name}` runs on the host"
+    return RULES[name].unsupported(eqn)
 
 
 def _unless_too_large(annotated: Annotated) -> Annotated | Unsupported:

@@ -18,6 +18,10 @@ from .dtypes import BYTES, parts_of
 from .instructions import Index, Instructions, Number
 
 
+# A byte as LLVM has it in a string, which it reads faster than numbers one by one.
+_ESCAPED = np.array([f"\\{byte:02X}" for byte in range(256)], "S3")
+
+
 class Memory:
     """A function's arrays; `heap` is how many bytes of them are not on the stack; `stack` and `on_heap` find them.
 
@@ -37,7 +41,8 @@ class Memory:
         self.room = 0
         self.free: dict[tuple[int, int], list[str]] = {}
         self.recycles = not always_copies
-        self.constants: list[str] = []
+        # Names of what is known, by its text: the same numbers are there once.
+        self.constants: dict[str, str] = {}
 
     def at(self, view: View, index: Sequence[Index]) -> Any:
         """The place of an entry in the buffer."""
@@ -86,12 +91,9 @@ class Memory:
     def constant_view(self, x: np.ndarray) -> View:
         """A known array, as data of the module."""
         kind, parts = parts_of(x.dtype)
-        stored = "i8" if kind == "i1" else kind
-        name = f"@{{name}}.{self.code.name()}"
-        numbers = np.ascontiguousarray(x).ravel()
-        numbers = numbers.view(np.real(numbers).dtype) if parts == 2 else numbers
-        texts = ", ".join(f"{stored} {self.code.text(y, kind) if kind != 'i1' else int(y)}" for y in numbers)
-        self.constants.append(f"{name} = private constant [{len(numbers)} x {stored}] [{texts}], align 64")
+        numbers = np.frombuffer(np.ascontiguousarray(x).tobytes(), np.uint8)
+        text = f'private constant [{len(numbers)} x i8] c"{_ESCAPED[numbers].tobytes().decode()}", align 64'
+        name = self.constants.setdefault(text, f"@{{name}}.{self.code.name()}")
         return View(x.dtype, x.shape, Buffer(name, kind, False, writable=False, parts=parts), row_major(x.shape))
 
     def entry(self, x: Operand, index: Sequence[Index]) -> Any:

@@ -55,6 +55,7 @@ class _Module:
             self._batch(place)
         else:
             self._store(self.lowering.run(self.jaxpr, self._arguments(None)), None, None)
+        constants = [f"{name} = {text}" for text, name in memory.constants.items()]
         found = [line for k in range(len(ins)) for line in buffer("%args", k, f"arg{k}")]
         found += [line for k in range(len(outs)) for line in buffer("%results", k, f"result{k}")]
         taken, given_back = self._heap()
@@ -70,7 +71,7 @@ class _Module:
             functions = in_threads([*found, *body], self._find_batch(), code.width)
         else:
             functions = alone([*found, *body], code.longest >= THRESHOLDS.long_loop)
-        return "\n".join([*memory.constants, *code.declared.values(), *self.lowering.procedures.lines, *functions])
+        return "\n".join([*constants, *code.declared.values(), *self.lowering.procedures.lines, *functions])
 
     def _find_batch(self) -> list[str]:
         """The instructions that find the size of the batch."""

@@ -24,6 +24,7 @@ class Rule:
     - `by_memory`: also what is small goes through memory, where a place is found at run time.
     - `fuses`: its result in memory is computed where it is used.
     - `nested`: it runs jaxprs of its own, on operands in registers or in memory as they come.
+    - `on_host`: it calls back to Python, which no GPU can.
     """
 
     lower: Callable[..., Any]
@@ -34,6 +35,7 @@ class Rule:
     by_memory: bool
     fuses: bool
     nested: bool
+    on_host: bool
 
     def unsupported(self, eqn: Equation) -> str | None:
         """Why this equation cannot be compiled, or `None`."""
@@ -74,14 +76,14 @@ def rule(
     by_memory: bool = False,
     fuses: bool = False,
     nested: bool = False,
+    on_host: bool = False,
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Enters a function as the rule of some primitives; what the arguments mean is said at `Rule`."""
     declared = (dtypes,) if isinstance(dtypes, frozenset) else tuple(dtypes)
 
     def enter(lower: Callable[..., Any]) -> Callable[..., Any]:
-        RULES.update(
-            dict.fromkeys(names.split(), Rule(lower, declared, requires, cost, moves, by_memory, fuses, nested))
-        )
+        entered = Rule(lower, declared, requires, cost, moves, by_memory, fuses, nested, on_host)
+        RULES.update(dict.fromkeys(names.split(), entered))
         return lower
 
     return enter

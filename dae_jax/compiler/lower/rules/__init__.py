@@ -7,6 +7,7 @@ from . import (
     contractions as contractions,
     elementwise as elementwise,
     floats as floats,
+    host as host,
     indexing as indexing,
     integers as integers,
     loops as loops,
