@@ -10,6 +10,7 @@ from .jaxprs.scalarise import scalarise as scalarise
 from .jaxprs.unchecked import without_checks as without_checks
 from .jaxprs.walk import (
     ALL_CALLS as ALL_CALLS,
+    WITH_DERIVATIVE as WITH_DERIVATIVE,
     called as called,
     equations as equations,
     is_large as is_large,

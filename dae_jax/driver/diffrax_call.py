@@ -28,7 +28,7 @@ from ..solvers import (
 from ..types import Time, Y
 from .bracket import bracketing
 from .crossings import OneCrossing, OnStates
-from .passages import Undetermined, passages, watched
+from .passages import passages, watched
 from .problem import Problem
 from .start import is_saved_part
 from .summed_errors import SummedErrors
@@ -120,9 +120,10 @@ def call(solve: "Solve", problem: Problem) -> tuple[Any, ...]:
     result = RESULTS.where(starts, RESULTS.promote(sol.result), RESULTS.no_finite_start)
     stats.update((path.split(".")[-1], operator.attrgetter(path)(sol.solver_state)) for path in counts(solver))
     state = lax.stop_gradient(cast(Any, sol.controller_state))
-    state, passed = (state, False) if passage is None else (state.steps, state.passed)
-    if isinstance(passage, Undetermined):
-        result, passed = RESULTS.where((result == RESULTS.successful) & passed, RESULTS.undetermined, result), False
+    passed = False
+    if passage is not None:
+        state, (passed, determined, _) = state
+        result = RESULTS.where((result == RESULTS.successful) & ~jnp.asarray(determined), RESULTS.undetermined, result)
     seen = state[-1] if sums_errors else None, passed
     return sol.t0, sol.t1, ts["user"], ys["user"], interpolation, stats, result, sol.event_mask, seen, end
 

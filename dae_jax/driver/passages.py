@@ -1,5 +1,5 @@
 """Steps that pass a configuration in which the constraints depend on each other, such as a dead centre, or leap over one, and steps
-to states at which the equations do not determine all unknowns.
+to states, or past states, at which the equations do not determine all unknowns.
 
 They are not tried again with a smaller step: what really passes such a point, a parallelogram say, can only leap.
 """
@@ -9,19 +9,33 @@ from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+from jax import lax
 
 from ..equations.manifold_ode import Equations
 from ..equations.mechanical import MechanicalODE
 from ..equations.regularity import mass_is_regular, passes_singularity
 from ..equations.structural_ode import StructuralODE
 from ..systems import is_mechanism
-from ..types import BoolScalar, Time, Y
+from ..types import BoolLike, BoolScalar, Time, Y
 from .problem import Problem
 
 
 # With more constraints a determinant takes longer than a step.
 MOST = 32
+# Relatively, the values of one determinant in a step in which its matrix jumps.
+ALIKE = 0.1
+
+
+class Seen(NamedTuple):
+    """Whether a step, or one before it, has `passed` such a configuration or ends at one, where all is not `determined`; `mark`: what
+    the next step is compared with.
+    """
+
+    passed: BoolLike
+    determined: BoolLike
+    mark: Any
 
 
 class Passage(eqx.Module):
@@ -35,19 +49,42 @@ class Passage(eqx.Module):
     drifts: bool = eqx.field(static=True)
     masses: bool = eqx.field(static=True)
 
-    def __call__(self, t0: Time, y0: Y, t1: Time, y1: Y, equations: Equations) -> BoolScalar:
+    def begin(self, t: Time, y: Y, equations: Equations) -> Seen:
+        """Before the first step."""
+        return Seen(jnp.asarray(False), True, None)
+
+    def __call__(self, t0: Time, y0: Y, t1: Time, y1: Y, equations: Equations, before: Seen) -> Seen:
         at = lambda t, y: self.ode.encode(self.decode(t, y, equations))
-        before, after = at(t0, y0), at(t1, y1)
-        passed = passes_singularity(self.ode, t0, before, t1, after, self.drifts)
-        return passed | ~mass_is_regular(self.ode, after[0], False) if self.masses else passed
+        start, end = at(t0, y0), at(t1, y1)
+        passed = passes_singularity(self.ode, t0, start, t1, end, self.drifts)
+        passed = passed | ~mass_is_regular(self.ode, end[0], False) if self.masses else passed
+        return Seen(before.passed | passed, True, None)
 
 
 class Undetermined(eqx.Module):
-    """Whether a step of an explicit method ends where the equations do not determine all highest derivatives."""
+    """Whether a step of an explicit method ends where the equations do not determine all highest derivatives, or passes such a point:
+    a determinant has another sign, and another value half-way. (Where the matrix jumps, with a switch, it has the value of one end.)
+    """
 
-    def __call__(self, t0: Time, y0: Y, t1: Time, y1: Y, equations: Equations) -> BoolScalar:
+    def begin(self, t: Time, y: Y, equations: Equations) -> Seen:
+        """Before the first step."""
         assert isinstance(equations, StructuralODE)
-        return ~equations.determines_highest(t1, y1)
+        return Seen(jnp.asarray(False), jnp.asarray(True), equations.determines_highest(t, y)[1])
+
+    def __call__(self, t0: Time, y0: Y, t1: Time, y1: Y, equations: Equations, before: Seen) -> Seen:
+        assert isinstance(equations, StructuralODE)
+        determined, after = equations.determines_highest(t1, y1)
+        turned = after[0] * before.mark[0] < 0
+
+        def passes() -> BoolScalar:
+            _, (_, half_way) = equations.determines_highest(
+                (t0 + t1) / 2, jax.tree.map(lambda a, b: (a + b) / 2, y0, y1)
+            )
+            jumps = (jnp.abs(half_way - before.mark[1]) < ALIKE) | (jnp.abs(half_way - after[1]) < ALIKE)
+            return jnp.any(turned & ~jumps)
+
+        passed = before.passed | lax.cond(jnp.any(turned), passes, lambda: jnp.asarray(False))
+        return Seen(passed, before.determined & determined, jnp.where(after[0] == 0, before.mark, after))
 
 
 def passages(
@@ -57,7 +94,7 @@ def passages(
     constraints, or where the matrix of highest derivatives is not constant.
     """
     if isinstance(ode, StructuralODE):
-        return Undetermined() if ode.varies else None
+        return Undetermined() if ode.varying else None
     system, t, state, args = problem.start
     if not is_mechanism(system):
         return None
@@ -74,10 +111,10 @@ def watched(controller: diffrax.AbstractStepSizeController, passage: Passage | U
 
 
 class _Watched(NamedTuple):
-    """The controller's state, and whether a step has passed such a configuration."""
+    """The controller's state, and what was seen of the steps."""
 
     steps: Any
-    passed: BoolScalar
+    seen: Seen
 
 
 class _AbstractWatchedSteps(diffrax.AbstractStepSizeController):
@@ -94,7 +131,7 @@ class _AbstractWatchedSteps(diffrax.AbstractStepSizeController):
         self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, error_order: Any
     ) -> tuple[Any, _Watched]:
         first, state = self.steps.init(terms, t0, t1, y0, dt0, args, func, error_order)
-        return first, _Watched(state, jnp.asarray(False))
+        return first, _Watched(state, self.passage.begin(self.direction * t0, y0, args))
 
     def adapt_step_size(
         self,
@@ -110,8 +147,10 @@ class _AbstractWatchedSteps(diffrax.AbstractStepSizeController):
         keep, *rest, state, result = self.steps.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state.steps
         )
-        passes = self.passage(self.direction * t0, y0, self.direction * t1, y1_candidate, args)
-        return keep, *rest, _Watched(state, controller_state.passed | (keep & passes)), result
+        before = controller_state.seen
+        after = self.passage(self.direction * t0, y0, self.direction * t1, y1_candidate, args, before)
+        kept = jax.tree.map(lambda new, old: jnp.where(keep, new, old), after, before)
+        return keep, *rest, _Watched(state, kept), result
 
 
 class WatchedSteps(_AbstractWatchedSteps):

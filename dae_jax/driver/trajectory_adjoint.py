@@ -93,6 +93,7 @@ def cotangents(
     first = int(part.t0)
     direction = jnp.where(taped.t1 < taped.t0, -1, 1)
     last = jnp.sum(jnp.isfinite(times)) - 1
+    last_saved, end = _last_needed(direction, times, save_times, wanted, first)
 
     def saved(numbers: PyTree, t: Time, y: Y) -> Any:
         all_of = eqx.combine(numbers, rest)
@@ -186,7 +187,8 @@ def cotangents(
     if part.t1:
         _, pull_back = jax.vjp(saved, numbers, taped.t1, _entry(points, last))
         of_numbers, of_t1, of_y = pull_back(_entry(wanted, -1))
-    carry = (last - 1, save_times.size - 1, of_y, _zeros(begin), of_numbers, zero, of_t1, jnp.zeros_like(save_times))
+        end = jnp.where(_is_zero(_entry(wanted, -1)), end, last - 1)
+    carry = (end, last_saved, of_y, _zeros(begin), of_numbers, zero, of_t1, jnp.zeros_like(save_times))
     _, _, of_y, of_begin, of_numbers, of_t0, of_t1, of_times = lax.while_loop(
         lambda carry: carry[0] >= 0, one_step, carry
     )
@@ -212,6 +214,25 @@ def saved_times(
     of_t0 = of_taped.t0 + of_t0 + (of_ts[0] if part.t0 else 0)
     of_t1 = of_taped.t1 + of_t1 + (of_ts[-1] if part.t1 else 0)
     return of_taped._replace(t0=of_t0, t1=of_t1, part=of_part)
+
+
+def _last_needed(
+    direction: IntScalar, times: Array, save_times: Array, wanted: PyTree[Array], first: int
+) -> tuple[IntScalar, IntScalar]:
+    """The last saved time whose cotangent is not 0, and the step that it is in; −1: none. What comes after it is left out: where a
+    solve fails it may have no derivative.
+    """
+    none = jnp.asarray(-1)
+    if not save_times.size:
+        return none, none
+    counts = ~jax.vmap(lambda j: _is_zero(_entry(wanted, first + j)))(jnp.arange(save_times.size))
+    last_saved = jnp.max(jnp.where(counts, jnp.arange(save_times.size), -1))
+    before = jnp.sum(jnp.isfinite(times) & (direction * (times - save_times[last_saved]) < 0)) - 1
+    return last_saved, jnp.where(last_saved < 0, -1, jnp.maximum(before, 0))
+
+
+def _is_zero(tree: PyTree[Array]) -> Any:
+    return jnp.all(jnp.stack([jnp.all(x == 0) for x in jax.tree.leaves(tree)]))
 
 
 def _entry(tree: PyTree[Array], i: IntScalar | int) -> Any:

@@ -17,9 +17,9 @@ from .mechanical import MechanicalODE, allowed_contradiction
 # A drift that counts as large as the solution itself, as a part of this: the distance to |q| = 1 is nowhere more than |q|/2.
 LARGE = 0.25
 # What a step may leave of the constraints that its method keeps, in parts of the tolerance, and what is left where the answer is
-# not to be trusted.
+# not to be trusted: a thousand tolerances, or of coarse ones a few and a visible part of the solution.
 LEFT = 100
-DRIFTED = 1000
+DRIFTED, FEW, VISIBLE = 1000, 10, 0.05
 # The change of the constraints' gradients on the way back from a drift that is suspicious, as one part in so many of them.
 FAR = 6
 # Tolerances that stand in for those of fixed steps.
@@ -280,7 +280,9 @@ def is_near_constraints(
         allowed = root * (1 + here) + by_tolerance + (0 if kept else LARGE * here)
         near = near & jnp.all(distance <= allowed)
         if not kept:
-            drifted = drifted | jnp.any(distance > root * (1 + here) + DRIFTED * (atol + rtol * here))
+            tolerance = atol + rtol * here
+            much = jnp.minimum(DRIFTED * tolerance, FEW * tolerance + VISIBLE * here)
+            drifted = drifted | jnp.any(distance > root * (1 + here) + much)
     return near & _redundant_agree(ode, t, end, root), drifted & (rtol + atol > 0)
 
 

@@ -21,11 +21,12 @@ from ..linalg import (
     relative_change,
     row_products,
     semidefinite_solve,
+    signed_log_determinant,
     solve,
     take,
     tearing,
 )
-from ..structure import interpreted
+from ..structure import Block, block_triangular, interpreted
 from ..systems import System, is_mechanism
 from ..types import Args, DType, Flat, IntScalar, Scalar, State, Time
 from .constraint_jacobian import Rank
@@ -44,6 +45,8 @@ from .taylor import total_derivatives
 STARTING = 100
 # A selection of states is kept until its smallest pivot is less than this part of the best one's.
 HYSTERESIS = 0.3
+# With more equations a determinant takes longer than a step.
+ORIENTED = 32
 # What of H may be round-off, in parts of its terms and of the resolution of numbers.
 OFF = 1000
 
@@ -124,8 +127,8 @@ class StructuralODE(ManifoldODE):
     orders: Orders = eqx.field(static=True)
     tearing: Tearing = eqx.field(static=True)
     sparse: SparseInvariants | None = eqx.field(static=True, default=None)
-    # Whether the matrix of the equations for X depends on anything.
-    varies: bool = eqx.field(static=True, default=True)
+    # The blocks of the matrix of the equations for X, rows and columns, that depend on anything.
+    varying: tuple[Block, ...] = eqx.field(static=True, default=())
 
     @classmethod
     def of(cls, form: ResidualForm, dtype: DType, complete: bool = False) -> "StructuralODE":
@@ -153,7 +156,9 @@ class StructuralODE(ManifoldODE):
         for i, variables in enumerate(found.pattern):
             present[i, variables] = True
         known = np.where(present, known, 0)
-        return dataclasses.replace(ode, tearing=tearing(known), varies=bool(np.isnan(known).any()))
+        blocks = block_triangular(found.pattern, found.sigma.transversal)
+        varying = tuple(block for block in blocks if np.isnan(known[np.ix_(*block)]).any())
+        return dataclasses.replace(ode, tearing=tearing(known), varying=varying)
 
     def _coefficients(self, dtype: DType) -> tuple[bool, Float[np.ndarray, "n n"]]:
         """Whether the highest derivatives enter linearly, that is whether their coefficients do not depend on them, and
@@ -212,11 +217,16 @@ class StructuralODE(ManifoldODE):
         return self.tearing.solve(*self._system(t, y, feedback))
 
     @at_one_instant
-    def determines_highest(self, t: Time, y: Float[Array, " N"]) -> Bool[Array, ""]:
-        """Whether the equations for X determine all of it, to round-off."""
+    def determines_highest(self, t: Time, y: Float[Array, " N"]) -> tuple[Bool[Array, ""], Float[Array, "2 blocks"]]:
+        """Whether the equations for X determine all of it, to round-off, and of the determinant of each varying block, with up to
+        `ORIENTED` equations, the sign and log |det|.
+        """
         matrix = lax.stop_gradient(self._system(t, y, None)[0])
         apply = lambda x: jnp.sum(matrix * x, 1)
-        return Probe.of(apply, lambda b: self.tearing.solve(matrix, b), jnp.ones(self.form.size, y.dtype)).determined
+        probe = Probe.of(apply, lambda b: self.tearing.solve(matrix, b), jnp.ones(self.form.size, y.dtype))
+        small = [np.ix_(*block) for block in self.varying if len(block.equations) <= ORIENTED]
+        determinants = [jnp.stack(signed_log_determinant(matrix[at])) for at in small]
+        return probe.determined, jnp.stack(determinants, 1) if small else jnp.zeros((2, 0), y.dtype)
 
     # The underlying ODE and the manifold
 

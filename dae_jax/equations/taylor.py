@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax.experimental import jet
 from jaxtyping import Array, Float
 
+from ..compiler import WITH_DERIVATIVE, equations
 from ..types import Flat, Scalar, Time
 
 
@@ -18,13 +19,16 @@ def total_derivatives(
 
     By Taylor arithmetic (`jax.experimental.jet`), whose cost grows with the square of the order (at order 6: a tenth of the
     operations of nested forward-mode derivatives, 0.2 s to compile in place of 1.5); by the latter where a primitive of F
-    has no rule for it.
+    has no rule for it, and where F has functions with a derivative of their own, which Taylor arithmetic does not ask for.
     """
     zeros = [jnp.zeros_like(orders[0])] * max(count + 1 - len(orders), 0)
     y = [*orders, *zeros][: count + 1]
     if count == 1:
         return [residual(t, y[0], y[1])]
     time = [jnp.ones_like(t), *[jnp.zeros_like(t)] * (count - 2)]
+    calls = equations(jax.make_jaxpr(residual)(t, y[0], y[1]))
+    if any(eqn.primitive.name in WITH_DERIVATIVE for eqn in calls):
+        return _nested(residual, t, y, count)
     try:
         first, others = jet.jet(residual, (t, y[0], y[1]), (time, y[1:-1], y[2:]))
     except (NotImplementedError, KeyError, TypeError):

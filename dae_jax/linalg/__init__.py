@@ -4,6 +4,7 @@ from .dense import (
     determinant_sign as determinant_sign,
     minor_sign as minor_sign,
     row_products as row_products,
+    signed_log_determinant as signed_log_determinant,
     solve as solve,
 )
 from .elimination import Elimination as Elimination, elimination as elimination, take as take

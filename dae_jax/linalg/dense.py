@@ -1,5 +1,7 @@
 """General square systems A x = b."""
 
+from typing import Any
+
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Inexact
@@ -37,16 +39,25 @@ def row_products(a: Float[Array, "m n"], b: Float[Array, "k n"]) -> Float[Array,
 
 
 def determinant_sign(a: Float[Array, "n n"]) -> Float[Array, ""]:
-    """The sign of det A, 0 of a singular A, by elimination with partial pivoting in plain arithmetic; LAPACK above 32 rows."""
+    """The sign of det A, 0 of a singular A."""
+    return signed_log_determinant(a)[0]
+
+
+def signed_log_determinant(a: Float[Array, "n n"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The sign of det A, 0 of a singular A, and log |det A|, by elimination with partial pivoting in plain arithmetic; LAPACK above
+    32 rows.
+    """
     if len(a) > LOOPED:
-        return jnp.linalg.slogdet(a)[0]
+        return tuple(jnp.linalg.slogdet(a))
+    if len(a) == 1:
+        return jnp.sign(a[0, 0]), jnp.log(jnp.abs(a[0, 0]))
 
-    def eliminate(j: IntScalar, carry: tuple[Float[Array, "n n"], Float[Array, ""]]):
-        a, sign = carry
+    def eliminate(j: IntScalar, carry: Any) -> Any:
+        a, sign, log = carry
         a, pivot = _eliminated(a, j)
-        return jnp.where(pivot == 0, 0, a), sign * jnp.sign(pivot)
+        return jnp.where(pivot == 0, 0, a), sign * jnp.sign(pivot), log + jnp.log(jnp.abs(pivot))
 
-    return lax.fori_loop(0, len(a), eliminate, (a, jnp.ones((), a.dtype)))[1]
+    return lax.fori_loop(0, len(a), eliminate, (a, jnp.ones((), a.dtype), jnp.zeros((), a.dtype)))[1:]
 
 
 def minor_sign(a: Float[Array, "n n"], rank: int) -> Float[Array, ""]:

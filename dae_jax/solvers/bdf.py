@@ -32,6 +32,7 @@ from .residual_steps import (
     simplified_newton,
     start_of,
     tolerances,
+    within,
 )
 
 
@@ -66,7 +67,7 @@ class NewtonPolynomial(diffrax.AbstractLocalInterpolation):
         used = jnp.where(self.jumped > 0, 0, self.order)
         phi = [jnp.where(j <= used, self.phi[j], 0) for j in ROWS]
         # After a jump in time diffrax asks for a point that is before the step by round-off.
-        inside = jnp.clip(t0, self.t0, self.t1)
+        inside = within(t0, self.t0, self.t1)
         y = phi[MAX_ORDER]
         for j in reversed(range(MAX_ORDER)):
             distance = inside - self.t1 + (self.psi[j - 1] if j else 0)

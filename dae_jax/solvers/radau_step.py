@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..compiler import is_large
 from .radau_coefficients import Coefficients, coefficients
-from .residual_steps import Tolerances, is_smallest
+from .residual_steps import Tolerances, is_smallest, within
 
 
 class CollocationPolynomial(diffrax.AbstractLocalInterpolation):
@@ -29,7 +29,7 @@ class CollocationPolynomial(diffrax.AbstractLocalInterpolation):
             return self.evaluate(t1) - self.evaluate(t0)
         h = self.t1 - self.t0
         # After a jump in time diffrax asks for a point that is before the step by round-off.
-        part = jnp.clip((t0 - self.t0) / jnp.where(h == 0, 1, h), 0, 1)
+        part = (within(t0, self.t0, self.t1) - self.t0) / jnp.where(h == 0, 1, h)
         # In a step that a jump may be in, the value is that after it.
         return self.y0 + jnp.where(is_smallest(self.t0, self.t1), self.z[-1], along(self.z, part))
 

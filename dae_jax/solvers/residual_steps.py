@@ -317,6 +317,11 @@ def at_min_step(failure: Failure, t0: Any, t1: Any, y0: Any, y1: Any, error: Any
     return y1, error, result
 
 
+def within(t: Any, t0: Any, t1: Any) -> Any:
+    """t, moved into the interval. Unlike that of `clip`, which is a half there, the derivative at the ends is that of t."""
+    return jnp.where(t < t0, t0, jnp.where(t > t1, t1, t))
+
+
 def constant(tree: Any) -> Any:
     """A pytree whose arrays have no derivative."""
     return jax.tree.map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, tree)

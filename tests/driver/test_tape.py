@@ -92,3 +92,23 @@ def test_gradient_of_a_long_chain_is_right():
     h = 1e-4
     central = (end(9.81 + h) - end(9.81 - h)) / (2 * h)
     np.testing.assert_allclose(jax.grad(end)(9.81), central, rtol=1e-7)
+
+
+@pytest.mark.parametrize("solver", [dae_jax.RadauIIA5(), dae_jax.BDF(), dae_jax.OrthogonalProjection(dae_jax.DOP853())])
+@pytest.mark.parametrize("direction", [1, -1])
+def test_what_was_saved_before_a_solve_failed_has_its_derivative(solver, direction):
+    """ẋ = −a x, and from |t| = ½ on no number."""
+    rate = lambda t, x, z, a: jnp.where(jnp.abs(t) > 0.5, jnp.nan, -a * x)
+    system = dae_jax.SemiExplicitDAE(rate, lambda t, x, z, a: z - x)
+    times = direction * jnp.array([0.2, 0.4, 0.8])
+
+    def reached(a):
+        saveat = diffrax.SaveAt(ts=times)
+        y0 = jnp.ones(1), jnp.ones(1)
+        sol = dae_jax.daesolve(system, solver, 0.0, direction * 1.0, None, y0, a, saveat=saveat, throw=False)
+        return jnp.sum(jnp.where(jnp.isfinite(sol.ys[0]), sol.ys[0], 0)), sol.result._value
+
+    slope, code = jax.grad(reached, has_aux=True)(2.0)
+    assert code != dae_jax.RESULTS.successful._value
+    at = np.array(times[:2])
+    np.testing.assert_allclose(slope, -(at * np.exp(-2 * at)).sum(), rtol=1e-5)

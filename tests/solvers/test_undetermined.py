@@ -104,3 +104,61 @@ def test_newton_leaves_no_equation_unsolved_in_which_derivatives_cancel():
 
     codes = jax.jit(jax.vmap(run))(1e-4 * np.exp(np.linspace(-1, 1, 200)))
     np.testing.assert_array_equal(codes, RESULTS.successful._value)
+
+
+# Index 1 up to a fold, where ∂g/∂z = 0 and the solution ends: x' = 1 from z = 2 at t = 4/3, and x' = −z at 3/2 − ln 2.
+FOLDS = {
+    "fold": (lambda t, x, z, a: jnp.ones(1), lambda t, x, z, a: z - z**3 / 3 - x, (-2 / 3, 2.0), 1.6),
+    "van der Pol": (lambda t, x, z, a: -z, lambda t, x, z, a: x - z**3 / 3 + z, (2 / 3, 2.0), 1.2),
+}
+EXPLICIT = {
+    "DOP853": dae_jax.DOP853(),
+    "Tsit5": diffrax.Tsit5(),
+    "projection of DOP853": dae_jax.OrthogonalProjection(dae_jax.DOP853()),
+    "projection of Tsit5": dae_jax.OrthogonalProjection(diffrax.Tsit5()),
+    "tangent space": dae_jax.TangentSpace(diffrax.Tsit5()),
+}
+
+
+def over(f, g, start, t1, solver, rtol):
+    y0 = tuple(jnp.array([x]) for x in start)
+    controller = diffrax.PIDController(rtol=rtol, atol=rtol)
+    sol = dae_jax.daesolve(
+        dae_jax.SemiExplicitDAE(f, g), solver, 0.0, t1, None, y0, stepsize_controller=controller, throw=False
+    )
+    return sol.result._value, sol.stats["doubts"]
+
+
+@pytest.mark.parametrize("method", EXPLICIT)
+@pytest.mark.parametrize("case", FOLDS)
+def test_a_fold_is_not_passed_without_a_word(case, method):
+    """Also at coarse tolerances, at which a step leaps over it, or the answer is off the equation."""
+    run = jax.jit(jax.vmap(lambda rtol: over(*FOLDS[case], EXPLICIT[method], rtol)))
+    tolerances = [1e-4, 1e-5, 1e-6] if (case, method) == ("van der Pol", "tangent space") else [1e-3, 1e-4, 1e-6]
+    codes, doubts = map(np.asarray, run(np.array(tolerances)))
+    assert ((codes != RESULTS.successful._value) | (doubts != 0)).all()
+    assert codes[-1] != RESULTS.successful._value
+
+
+def test_two_folds_at_once_are_seen():
+    """The determinant of both together keeps its sign."""
+    _, g, (x, z), t1 = FOLDS["fold"]
+    y0 = jnp.full(2, x), jnp.full(2, z)
+    system = dae_jax.SemiExplicitDAE(lambda t, x, z, a: jnp.ones(2), g)
+    solver, controller = EXPLICIT["projection of Tsit5"], diffrax.PIDController(rtol=1e-3, atol=1e-3)
+    with pytest.warns(dae_jax.AccuracyWarning, match="has passed a configuration"):
+        dae_jax.daesolve(system, solver, 0.0, t1, None, y0, stepsize_controller=controller)
+
+
+@pytest.mark.parametrize("method", EXPLICIT)
+def test_what_stays_regular_is_not_doubted(method):
+    """A matrix that turns, by more than a right angle in all: rotations have the determinant 1."""
+
+    def g(t, x, z, a):
+        c, s = jnp.cos(9 * t), jnp.sin(9 * t)
+        return jnp.stack([c * z[0] - s * z[1] + c * x[0], s * z[0] + c * z[1] + s * x[0]])
+
+    system = dae_jax.SemiExplicitDAE(lambda t, x, z, a: z[:1] + z[1:], g)
+    sol = dae_jax.daesolve(system, EXPLICIT[method], 0.0, 1.0, None, (jnp.ones(1), jnp.array([-1.0, 0.0])))
+    assert sol.stats["doubts"] == 0
+    np.testing.assert_allclose(sol.ys[0][-1], np.exp(-1), rtol=1e-5)

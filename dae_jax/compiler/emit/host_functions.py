@@ -2,6 +2,7 @@
 
 import ctypes
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -26,9 +27,9 @@ class _Numbers:
 
     def at(self, address: int) -> np.ndarray:
         """The memory there, with the parts of numbers first and the lanes last."""
-        parts, real = (2 if self.dtype.kind == "c" else 1), np.zeros((), self.dtype).real.dtype
+        parts, real = (2 if self.dtype.kind == "c" else 1), np.real(np.zeros((), self.dtype)).dtype
         shape = (parts, *self.shape, self.width)
-        memory = (ctypes.c_char * (int(np.prod(shape)) * real.itemsize)).from_address(address)
+        memory: Any = (ctypes.c_char * (math.prod(shape) * real.itemsize)).from_address(address)
         return np.frombuffer(memory, real).reshape(shape)
 
     def read(self, memory: np.ndarray, lane: int) -> np.ndarray:

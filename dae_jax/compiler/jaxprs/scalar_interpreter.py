@@ -26,7 +26,7 @@ from .walk import CALLS, WITH_DERIVATIVE, called
 ELEMENTWISE = frozenset(
     "abs acos acosh add and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type cos cosh digamma div eq "
     "erf erf_inv erfc exp exp2 expm1 floor ge gt integer_pow is_finite le lgamma log log1p logistic lt max min mul ne "
-    "neg nextafter not or pow rem round rsqrt select_n sign sin sinh sqrt square sub tan tanh xor".split()
+    "neg nextafter not or pow rem round rsqrt select_n sign sin sinh sqrt square stop_gradient sub tan tanh xor".split()
 )
 _AT_PLACES = frozenset({"dynamic_slice", "gather", "scatter", "scatter-add"})
 _COMBINING = frozenset({"add_any", "dot_general", "reduce_max", "reduce_sum"})
@@ -159,6 +159,8 @@ class ScalarInterpreter(Generic[E]):
                 return x[1 + min(max(int(x[0]), 0), len(x) - 2)]
             case "convert_element_type" if is_number(x[0]):
                 return converted(x[0], eqn.params["new_dtype"])
+            case "stop_gradient" if is_number(x[0]):
+                return x[0]
             case "div" if is_number(x[0], 0):
                 return x[0]
             case "integer_pow" if eqn.params["y"] == 1:
