@@ -256,7 +256,7 @@ def _outline(
     combination: Combination,
 ) -> JacobianStructure:
     by_y, by_rate = on_y.whole(), on_rate.whole()
-    storage = _storage(by_y + by_rate, by_rate, highest_value_transversal(signature(by_y, by_rate)))
+    storage = _storage(by_y + by_rate, by_rate, highest_value_transversal(signature(by_y, by_rate)), hidden)
     small = len(indices) <= LOOPED
     return JacobianStructure(
         storage,
@@ -270,14 +270,15 @@ def _outline(
     )
 
 
-def _storage(pattern: csr_array, by_rate: csr_array, transversal: list[int]) -> Storage:
-    """A band, with each equation in the place of its variable, or sparse factors, where that is cheaper."""
+def _storage(pattern: csr_array, by_rate: csr_array, transversal: list[int], hidden: bool) -> Storage:
+    """Sparse factors, or a band with each equation in the place of its variable, where that is cheaper."""
     n = len(transversal)
     if n <= LOOPED:
         return Dense(n)
     pairing = np.array(transversal)
-    # In a band a whole solve is one kernel, but one that takes long to compile.
-    if n <= LARGE:
+    # Where constraints are hidden, pivots along the diagonal are small: a band is eliminated with partial pivoting within the kernel.
+    # Of index 1, 144 unknowns of a heat equation take 0.9 ms with sparse factors and 10.9 in a band.
+    if hidden and n <= LARGE:
         equation_of = np.argsort(pairing)
         paired = pattern[equation_of]
         order = reverse_cuthill_mckee((paired + paired.T).toarray())
