@@ -156,21 +156,24 @@ class ResidualPlan(Plan):
 
     - `unknowns`; `indices`: the index of each, by which its errors are weighted.
     - `derivatives`: of how many unknowns the derivative occurs.
-    - `colours`: directional derivatives for ∂F/∂y and ∂F/∂ẏ.
+    - `colours`: directional derivatives for ∂F/∂y and ∂F/∂ẏ; `gradients`: rows of both with so many entries that they are found by
+      themselves, in reverse mode.
     """
 
     unknowns: int
     indices: tuple[int, ...]
     derivatives: int
     colours: tuple[int, int]
+    gradients: int = 0
 
     def _found(self) -> dict[str, str]:
         counts = [f"{self.indices.count(k)} of index {k}" for k in sorted(set(self.indices))]
         by_y, by_rate = self.colours
+        rows = f", {counted(self.gradients, 'full row')} in reverse mode" if self.gradients else ""
         return {
             "system": f"{counted(self.unknowns, 'unknown')}, derivatives of {self.derivatives} occur",
             "unknowns": ", ".join(counts),
-            "Jacobians": f"∂F/∂y from {counted(by_y, 'directional derivative')}, ∂F/∂ẏ from {by_rate}",
+            "Jacobians": f"∂F/∂y from {counted(by_y, 'directional derivative')}, ∂F/∂ẏ from {by_rate}{rows}",
             "linear systems": self.linear_solver,
             "residual": counted(self.operations, "operation"),
         }
@@ -273,7 +276,8 @@ def _of_residual(
     linearised: LinearisedResidual, t0: Time, y: Flat, method: str, precision: str, compiled: dict[str, Any]
 ) -> ResidualPlan:
     structure, n = linearised.structure, y.size
-    by_y, by_rate = (n if c is None else c.count for c in (structure.by_y, structure.by_rate))
+    compressed = structure.by_y, structure.by_rate
+    by_y, by_rate = (n if c is None else c.count for c in compressed)
     colours = by_y, by_rate
     return ResidualPlan(
         method=method,
@@ -286,6 +290,7 @@ def _of_residual(
         indices=structure.indices,
         derivatives=int(structure.differential.sum()),
         colours=colours,
+        gradients=sum(len(c.full) for c in compressed if c is not None),
     )
 
 

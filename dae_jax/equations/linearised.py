@@ -16,7 +16,6 @@ from ..linalg.dense import LOOPED
 from ..linalg.sparse import Sparse
 from ..linalg.storage import Banded, Dense
 from ..structure import (
-    column_colouring,
     highest_value_transversal,
     reverse_cuthill_mckee,
     shape_of,
@@ -292,10 +291,8 @@ def _storage(pattern: csr_array, by_rate: csr_array, transversal: list[int], hid
 
 
 def _compression(pattern: csr_array, storage: Storage) -> Compression:
-    colours = column_colouring(pattern)
     rows, columns = storage.positions()
-    used = (columns >= 0) & _is_in(pattern, rows, columns)
-    return Compression(colours, np.where(used, colours[columns] * storage.size + rows, -1))
+    return Compression.of(pattern, rows, columns, (columns >= 0) & _is_in(pattern, rows, columns))
 
 
 def _is_in(pattern: csr_array, rows: Int[np.ndarray, "*stored"], columns: Int[np.ndarray, "*stored"]) -> Any:
