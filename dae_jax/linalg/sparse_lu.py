@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Inexact, PyTree
 from ..compiler import jit
 from ..types import IntScalar
 from .storage import magnitude
-from .symbolic_lu import SymbolicLU
+from .symbolic_lu import TOGETHER, SymbolicLU
 
 
 class Factors(NamedTuple):
@@ -41,9 +41,8 @@ def eliminated(a: Inexact[Array, " entries"], k: SymbolicLU) -> Factors:
         scale = 1 / jnp.where(size > 0, size, 1)
         spread = lambda p, work: _set(work, _get(k.given_at, p), scale * _get(a, _get(k.given, p)))
         work = lax.fori_loop(begin, end, spread, work)
-        middle, end = _get(k.diagonal, i), _get(k.start, i + 1)
 
-        def eliminate(p: IntScalar, carry: Any) -> Any:
+        def one(p: IntScalar, carry: Any) -> Any:
             lu, work, largest = carry
             column = _get(k.at, p)
             pivot = _get(k.diagonal, column)
@@ -54,7 +53,35 @@ def eliminated(a: Inexact[Array, " entries"], k: SymbolicLU) -> Factors:
             )
             return _set(lu, p, factor), work, jnp.maximum(largest, magnitude(factor))
 
-        lu, work, largest = lax.fori_loop(_get(k.start, i), middle, eliminate, (lu, work, largest))
+        def many(p: IntScalar, carry: Any) -> Any:
+            lu, work, largest = carry
+            column = _get(k.at, p)
+            pivots = [_get(k.diagonal, column + j) for j in range(TOGETHER)]
+            factors: list[Any] = []
+            for j, pivot in enumerate(pivots):
+                # In the row of U of pivot i the column of pivot j is j − i places after it.
+                others = [f * _get(lu, pivots[i] + (j - i)) for i, f in enumerate(factors)]
+                factors.append((_get(work, column + j) - sum(others)) * _get(lu, pivot))
+            last = pivots[-1]
+
+            def subtract(q: IntScalar, work: Array) -> Array:
+                rows = [f * _get(lu, pivot + (TOGETHER - 1 - j) + (q - last)) for j, (f, pivot) in enumerate(pairs)]
+                return _add(work, _get(k.at, q), -sum(rows))
+
+            pairs = list(zip(factors, pivots, strict=True))
+            for j, factor in enumerate(factors):
+                work, lu = _set(work, column + j, jnp.zeros_like(factor)), _set(lu, p + j, factor)
+                largest = jnp.maximum(largest, magnitude(factor))
+            return lu, lax.fori_loop(last + 1, _get(k.start, column + TOGETHER), subtract, work), largest
+
+        def eliminate(g: IntScalar, carry: Any) -> Any:
+            # A loop of one turn or none: what a branch gives would be copied.
+            p, together = _get(k.group, g), _get(k.is_many, g)
+            carry = lax.fori_loop(jnp.uint32(0), together, lambda _, carry: many(p, carry), carry)
+            return lax.fori_loop(together, jnp.uint32(1), lambda _, carry: one(p, carry), carry)
+
+        begin, end = _get(k.group_start, i), _get(k.group_start, i + 1)
+        lu, work, largest = lax.fori_loop(begin, end, eliminate, (lu, work, largest))
 
         def keep(q: IntScalar, carry: Any) -> Any:
             lu, work, largest = carry
@@ -62,7 +89,8 @@ def eliminated(a: Inexact[Array, " entries"], k: SymbolicLU) -> Factors:
             lu, work = _set(lu, q, value), _set(work, _get(k.at, q), jnp.zeros_like(value))
             return lu, work, jnp.maximum(largest, magnitude(value))
 
-        lu, work, largest = lax.fori_loop(middle, end, keep, (lu, work, largest))
+        middle = _get(k.diagonal, i)
+        lu, work, largest = lax.fori_loop(middle, _get(k.start, i + 1), keep, (lu, work, largest))
         return _set(lu, middle, 1 / _get(lu, middle)), work, _set(scales, i, scale), largest
 
     n = k.rows.shape[0]

@@ -13,6 +13,8 @@ from jaxtyping import Int
 # By how much diagonal entries exceed the others of their row together, where an elimination with numbers finds the pattern: more,
 # and fill far from the diagonal would underflow.
 DOMINANCE = 1e-6
+# So many rows of one pattern are subtracted at once, which reads and writes what is left of a row once in place of as often.
+TOGETHER = 4
 
 
 class SymbolicLU(NamedTuple):
@@ -20,7 +22,9 @@ class SymbolicLU(NamedTuple):
     find and use the factors: one kernel serves all patterns of a size.
 
     `rows`, `columns`: which of A stand where; `start`, `diagonal`, `at`: where each row begins and has its diagonal, and the
-    columns of its entries; `given_start`, `given`, `given_at`: the same of the entries of A, with their numbers.
+    columns of its entries; `given_start`, `given`, `given_at`: the same of the entries of A, with their numbers. Entries of L are
+    taken one after the other or, where they stand beside each other and belong to rows of U of one pattern, by `TOGETHER`:
+    `group_start`, `group`, `is_many`: where the groups of each row begin, the first entry of each, whether it is one of so many.
     """
 
     rows: Int[np.ndarray, " n"]
@@ -31,6 +35,9 @@ class SymbolicLU(NamedTuple):
     given_start: Int[np.ndarray, " n+1"]
     given: Int[np.ndarray, " entries"]
     given_at: Int[np.ndarray, " entries"]
+    group_start: Int[np.ndarray, " n+1"]
+    group: Int[np.ndarray, " groups"]
+    is_many: Int[np.ndarray, " groups"]
 
     @property
     def size(self) -> int:
@@ -77,14 +84,39 @@ def symbolic_lu(
     at_row, at_column = position[paired], position[columns]
     given = np.lexsort((at_column, at_row))
     row_of_entry = np.repeat(np.arange(n), np.diff(filled.indptr))
+    diagonal = np.flatnonzero(row_of_entry == filled.indices)
     indices = (
         np.argsort(pairing)[variables],
         variables,
         filled.indptr,
-        np.flatnonzero(row_of_entry == filled.indices),
+        diagonal,
         filled.indices,
         np.searchsorted(at_row[given], np.arange(n + 1)),
         given,
         at_column[given],
+        *_groups(filled.indptr, diagonal, filled.indices),
     )
     return SymbolicLU(*(x.astype(np.uint32) for x in indices))
+
+
+def _groups(
+    start: Int[np.ndarray, " n+1"], diagonal: Int[np.ndarray, " n"], at: Int[np.ndarray, " filled"]
+) -> tuple[Int[np.ndarray, " n+1"], Int[np.ndarray, " groups"], Int[np.ndarray, " groups"]]:
+    """The groups of the entries of L: where those of each row begin, their first entries, and whether they are of `TOGETHER`."""
+    n, more = len(diagonal), TOGETHER - 1
+    entries = np.concatenate([at, np.full(more, -1)])
+    # Of row k and the next ones each has the pattern of the last, and the columns before: as many entries as fit.
+    first = np.arange(max(n - more, 0))
+    after = start[1:] - diagonal
+    alike = np.zeros(n, bool)
+    alike[first] = (after[first] == after[first + more] + more) & (entries[diagonal[first] + more] == first + more)
+    whole = alike[at] & (entries[np.arange(len(at)) + more] == at + more)
+    group_start, group, many = [0], [], []
+    for p, end in zip(start[:-1].tolist(), diagonal.tolist(), strict=True):
+        while p < end:
+            group.append(p)
+            many.append(bool(whole[p]) and p + more < end)
+            p += TOGETHER if many[-1] else 1
+        group_start.append(len(group))
+    # One more, as nothing can be read from an array of none.
+    return np.array(group_start), np.array([*group, 0]), np.array([*many, False])

@@ -26,9 +26,10 @@ HEAVY = 45_000
 # addresses, 46 long loops) is ready in 4.6 s without them and in 8.1 with, and takes 3.6 and 2.9 ms; Andrews' mechanism by Radau
 # (7,000 and 340) in 6 and 12 s, and takes 49 and 22 ms.
 ADDRESSES, PER_LOOP, LONG = 5_000, 50, 25
-# And modules of more loops, each of which takes the passes 10 ms: one evaluation of a Stewart platform (730) is ready in 13 s with
-# them and in 2.4 without, and takes 75 and 90 µs; Andrews' mechanism by Radau (440) gains by them.
-LOOPS = 500
+# And modules of more loops, each of which takes the passes 10 ms, unless a half of them is `VERY_LONG`: one evaluation of a Stewart
+# platform (730) is ready in 7.7 s with them and in 1.5 without, and takes 45 and 63 µs; Andrews' mechanism by Radau (440) gains by them,
+# and so does a system of 3,000 unknowns by Radau (530, of which 460 are long), which takes 400 ms and 870 without.
+LOOPS, VERY_LONG = 500, 256
 
 
 # Where the index of a loop over an array begins.
@@ -53,6 +54,7 @@ def key(text: str, target: Target, passes: bool) -> str:
         PER_LOOP,
         LONG,
         LOOPS,
+        VERY_LONG,
         text,
     )
     return hashlib.sha256(repr(made).encode()).hexdigest()
@@ -83,12 +85,12 @@ def object_code(
 
 def _gains_by_passes(text: str) -> bool:
     """Whether LLVM's passes gain more than they take."""
-    if text.count("\n") >= HEAVY or text.count(_LOOP) > LOOPS:
+    loops, turns = text.count(_LOOP), [int(last) for last in _TURNS.findall(text)]
+    longer = lambda least: sum(last >= least for last in turns)
+    if text.count("\n") >= HEAVY or (loops > LOOPS and 2 * longer(VERY_LONG) < loops):
         return False
     addresses = text.count("getelementptr")
-    if addresses < ADDRESSES:
-        return True
-    return PER_LOOP * sum(int(turns) >= LONG for turns in _TURNS.findall(text)) > addresses
+    return addresses < ADDRESSES or PER_LOOP * longer(LONG) > addresses
 
 
 def parsed(text: str) -> Any:

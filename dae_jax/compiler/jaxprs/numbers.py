@@ -58,6 +58,10 @@ def is_on_numbers(eqn: Equation) -> bool:
 
 def _of_numbers(eqn: Equation) -> Any:
     name = eqn.primitive.name
+    if name == "convert_element_type":
+        return lambda x: converted(x, eqn.params["new_dtype"])
+    if name == "select_n" and len(eqn.invars) == 3 and eqn.invars[0].aval.dtype == bool:
+        return lambda which, first, second: np.where(which, second, first)
     if name in _OF_FLOATS and jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.floating):
         return _OF_FLOATS[name]
     return _EXACT.get(name)
