@@ -65,8 +65,9 @@ def eliminated(a: Inexact[Array, " entries"], k: SymbolicLU) -> Factors:
             last = pivots[-1]
 
             def subtract(q: IntScalar, work: Array) -> Array:
-                rows = [f * _get(lu, pivot + (TOGETHER - 1 - j) + (q - last)) for j, (f, pivot) in enumerate(pairs)]
-                return _add(work, _get(k.at, q), -sum(rows))
+                terms = [f * _get(lu, pivot + (TOGETHER - 1 - j) + (q - last)) for j, (f, pivot) in enumerate(pairs)]
+                less: Any = sum(terms)
+                return _add(work, _get(k.at, q), -less)
 
             pairs = list(zip(factors, pivots, strict=True))
             for j, factor in enumerate(factors):
