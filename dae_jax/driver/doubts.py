@@ -44,11 +44,11 @@ _SENTENCES = {
         "hundredth of the solution. Use a smaller tolerance or a method of higher order, and compare."
     ),
     Doubt.PASSED: (
-        "On its way the solution has passed a configuration in which the constraints depend on each other, such as a dead centre, or a "
-        "mass is negative, or has drifted so far that it may be on the wrong side of one: there the motion may go on in another way. "
-        "(Steps in which the "
-        "constraints turn by more than a right angle are taken for such a passage too.) Look whether it goes on as is meant; a method "
-        "that keeps the constraints and smaller tolerances or steps tell what comes near one from what passes it."
+        "On its way the solution has passed a configuration in which the constraints depend on each other, such as a dead centre, or "
+        "the equations do not determine all derivatives, as at a fold, or a mass is negative, or has drifted so far that it may be on "
+        "the wrong side of one: there it may go on in another way, or end. (Steps in which the constraints turn by more than a right "
+        "angle are taken for such a passage too.) Look whether it goes on as is meant; a method that keeps the constraints and smaller "
+        "tolerances or steps tell what comes near one from what passes it."
     ),
 }
 

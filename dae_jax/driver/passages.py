@@ -67,24 +67,35 @@ class Undetermined(eqx.Module):
     """
 
     def begin(self, t: Time, y: Y, equations: Equations) -> Seen:
-        """Before the first step."""
+        """Before the first step, whose start is yet to be looked at."""
         assert isinstance(equations, StructuralODE)
-        return Seen(jnp.asarray(False), jnp.asarray(True), equations.determines_highest(t, y)[1])
+        unknown = jnp.full((2, len(equations.oriented)), jnp.nan, jnp.result_type(t))
+        return Seen(jnp.asarray(False), jnp.asarray(True), unknown)
 
     def __call__(self, t0: Time, y0: Y, t1: Time, y1: Y, equations: Equations, before: Seen) -> Seen:
         assert isinstance(equations, StructuralODE)
-        determined, after = equations.determines_highest(t1, y1)
-        turned = after[0] * before.mark[0] < 0
 
-        def passes() -> BoolScalar:
-            _, (_, half_way) = equations.determines_highest(
-                (t0 + t1) / 2, jax.tree.map(lambda a, b: (a + b) / 2, y0, y1)
+        def goes_on(carry: Any) -> BoolScalar:
+            k, _, (start, end, _) = carry
+            return (k < 2) | (k == 2) & jnp.any(end[0] * start[0] < 0)
+
+        # At the start if that is not known yet, at the end, half-way if need be: in a loop, so that it is compiled once.
+        def look(carry: Any) -> Any:
+            k, _, found = carry
+            at = lambda a, b: jnp.where(k == 0, a, jnp.where(k == 1, b, (a + b) / 2))
+            determined, here = equations.determines_highest(at(t0, t1), jax.tree.map(at, y0, y1))
+            return (
+                k + 1,
+                jnp.where(k == 1, determined, carry[1]),
+                jnp.where(jnp.arange(3)[:, None, None] == k, here, found),
             )
-            jumps = (jnp.abs(half_way - before.mark[1]) < ALIKE) | (jnp.abs(half_way - after[1]) < ALIKE)
-            return jnp.any(turned & ~jumps)
 
-        passed = before.passed | lax.cond(jnp.any(turned), passes, lambda: jnp.asarray(False))
-        return Seen(passed, before.determined & determined, jnp.where(after[0] == 0, before.mark, after))
+        first = jnp.where(jnp.any(jnp.isnan(before.mark[0])), 0, 1)
+        marks = jnp.stack([before.mark] * 3)
+        _, determined, (start, end, half_way) = lax.while_loop(goes_on, look, (first, jnp.asarray(True), marks))
+        jumps = (jnp.abs(half_way[1] - start[1]) < ALIKE) | (jnp.abs(half_way[1] - end[1]) < ALIKE)
+        passed = before.passed | jnp.any((end[0] * start[0] < 0) & ~jumps)
+        return Seen(passed, before.determined & determined, jnp.where(end[0] == 0, start, end))
 
 
 def passages(

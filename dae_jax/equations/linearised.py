@@ -89,7 +89,8 @@ class LinearisedResidual(eqx.Module):
         indices = indices or found.indices
         offsets = found.sigma.variable_offsets
         patterns = _PatternKey.of(found.by_y), _PatternKey.of(found.by_rate)
-        return cls(form, _outline(*patterns, indices, offsets, found.index > 1, found.combination))
+        on_gpu = jax.default_backend() == "gpu"
+        return cls(form, _outline(*patterns, indices, offsets, found.index > 1, found.combination, on_gpu))
 
     @property
     def storage(self) -> Storage:
@@ -253,9 +254,10 @@ def _outline(
     offsets: tuple[int, ...],
     hidden: bool,
     combination: Combination,
+    on_gpu: bool,
 ) -> JacobianStructure:
     by_y, by_rate = on_y.whole(), on_rate.whole()
-    storage = _storage(by_y + by_rate, by_rate, highest_value_transversal(signature(by_y, by_rate)), hidden)
+    storage = _storage(by_y + by_rate, by_rate, highest_value_transversal(signature(by_y, by_rate)), hidden or on_gpu)
     small = len(indices) <= LOOPED
     return JacobianStructure(
         storage,
@@ -269,15 +271,15 @@ def _outline(
     )
 
 
-def _storage(pattern: csr_array, by_rate: csr_array, transversal: list[int], hidden: bool) -> Storage:
-    """Sparse factors, or a band with each equation in the place of its variable, where that is cheaper."""
+def _storage(pattern: csr_array, by_rate: csr_array, transversal: list[int], pivots: bool) -> Storage:
+    """Sparse factors or, where `pivots` are to be chosen within the kernel, a band with each equation in the place of its variable."""
     n = len(transversal)
     if n <= LOOPED:
         return Dense(n)
     pairing = np.array(transversal)
-    # Where constraints are hidden, pivots along the diagonal are small: a band is eliminated with partial pivoting within the kernel.
-    # Of index 1, 144 unknowns of a heat equation take 0.9 ms with sparse factors and 10.9 in a band.
-    if hidden and n <= LARGE:
+    # Where constraints are hidden, pivots along the diagonal are small, and a GPU cannot leave them to the host. Otherwise 144 unknowns
+    # of a heat equation take 0.9 ms with sparse factors and 10.9 in a band.
+    if pivots and n <= LARGE:
         equation_of = np.argsort(pairing)
         paired = pattern[equation_of]
         order = reverse_cuthill_mckee((paired + paired.T).toarray())

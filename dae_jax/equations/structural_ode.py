@@ -216,17 +216,21 @@ class StructuralODE(ManifoldODE):
         """X, the derivatives of order Dⱼ."""
         return self.tearing.solve(*self._system(t, y, feedback))
 
+    @property
+    def oriented(self) -> list[Block]:
+        """The varying blocks of the matrix of the equations for X, but for large ones."""
+        return [block for block in self.varying if len(block.equations) <= ORIENTED]
+
     @at_one_instant
     def determines_highest(self, t: Time, y: Float[Array, " N"]) -> tuple[Bool[Array, ""], Float[Array, "2 blocks"]]:
-        """Whether the equations for X determine all of it, to round-off, and of the determinant of each varying block, with up to
-        `ORIENTED` equations, the sign and log |det|.
+        """Whether the equations for X determine all of it, to round-off, and of the determinant of each `oriented` block the sign and
+        log |det|.
         """
         matrix = lax.stop_gradient(self._system(t, y, None)[0])
         apply = lambda x: jnp.sum(matrix * x, 1)
         probe = Probe.of(apply, lambda b: self.tearing.solve(matrix, b), jnp.ones(self.form.size, y.dtype))
-        small = [np.ix_(*block) for block in self.varying if len(block.equations) <= ORIENTED]
-        determinants = [jnp.stack(signed_log_determinant(matrix[at])) for at in small]
-        return probe.determined, jnp.stack(determinants, 1) if small else jnp.zeros((2, 0), y.dtype)
+        found = [jnp.stack(signed_log_determinant(matrix[np.ix_(*block)])) for block in self.oriented]
+        return probe.determined, jnp.stack(found, 1) if found else jnp.zeros((2, 0), y.dtype)
 
     # The underlying ODE and the manifold
 

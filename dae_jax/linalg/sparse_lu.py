@@ -28,76 +28,85 @@ class Factors(NamedTuple):
     largest: Float[Array, ""]
 
 
+class _Partial(NamedTuple):
+    """What is there while rows are eliminated: the factors, what is left of the row, and the largest number of the factors."""
+
+    lu: Inexact[Array, " filled"]
+    work: Inexact[Array, " n"]
+    largest: Float[Array, ""]
+
+
 @jit
 def eliminated(a: Inexact[Array, " entries"], k: SymbolicLU) -> Factors:
     """The factors of the matrix with entries `a`."""
-    real = jnp.finfo(a.dtype).dtype
+    n, real = k.rows.shape[0], jnp.finfo(a.dtype).dtype
     zero = jnp.zeros((), real)
 
-    def row(i: IntScalar, carry: Any) -> Any:
-        lu, work, scales, largest = carry
+    def row(i: IntScalar, carry: tuple[_Partial, Array]) -> Any:
+        (lu, work, largest), scales = carry
         begin, end = _get(k.given_start, i), _get(k.given_start, i + 1)
         size = lax.fori_loop(begin, end, lambda p, s: jnp.maximum(s, magnitude(_get(a, _get(k.given, p)))), zero)
         scale = 1 / jnp.where(size > 0, size, 1)
         spread = lambda p, work: _set(work, _get(k.given_at, p), scale * _get(a, _get(k.given, p)))
-        work = lax.fori_loop(begin, end, spread, work)
-
-        def one(p: IntScalar, carry: Any) -> Any:
-            lu, work, largest = carry
-            column = _get(k.at, p)
-            pivot = _get(k.diagonal, column)
-            factor = _get(work, column) * _get(lu, pivot)
-            subtract = lambda q, work: _add(work, _get(k.at, q), -factor * _get(lu, q))
-            work = lax.fori_loop(
-                pivot + 1, _get(k.start, column + 1), subtract, _set(work, column, jnp.zeros_like(factor))
-            )
-            return _set(lu, p, factor), work, jnp.maximum(largest, magnitude(factor))
-
-        def many(p: IntScalar, carry: Any) -> Any:
-            lu, work, largest = carry
-            column = _get(k.at, p)
-            pivots = [_get(k.diagonal, column + j) for j in range(TOGETHER)]
-            factors: list[Any] = []
-            for j, pivot in enumerate(pivots):
-                # In the row of U of pivot i the column of pivot j is j − i places after it.
-                others = [f * _get(lu, pivots[i] + (j - i)) for i, f in enumerate(factors)]
-                factors.append((_get(work, column + j) - sum(others)) * _get(lu, pivot))
-            last = pivots[-1]
-
-            def subtract(q: IntScalar, work: Array) -> Array:
-                terms = [f * _get(lu, pivot + (TOGETHER - 1 - j) + (q - last)) for j, (f, pivot) in enumerate(pairs)]
-                less: Any = sum(terms)
-                return _add(work, _get(k.at, q), -less)
-
-            pairs = list(zip(factors, pivots, strict=True))
-            for j, factor in enumerate(factors):
-                work, lu = _set(work, column + j, jnp.zeros_like(factor)), _set(lu, p + j, factor)
-                largest = jnp.maximum(largest, magnitude(factor))
-            return lu, lax.fori_loop(last + 1, _get(k.start, column + TOGETHER), subtract, work), largest
-
-        def eliminate(g: IntScalar, carry: Any) -> Any:
-            # A loop of one turn or none: what a branch gives would be copied.
-            p, together = _get(k.group, g), _get(k.is_many, g)
-            carry = lax.fori_loop(jnp.uint32(0), together, lambda _, carry: many(p, carry), carry)
-            return lax.fori_loop(together, jnp.uint32(1), lambda _, carry: one(p, carry), carry)
-
+        found = _Partial(lu, lax.fori_loop(begin, end, spread, work), largest)
         begin, end = _get(k.group_start, i), _get(k.group_start, i + 1)
-        lu, work, largest = lax.fori_loop(begin, end, eliminate, (lu, work, largest))
-
-        def keep(q: IntScalar, carry: Any) -> Any:
-            lu, work, largest = carry
-            value = _get(work, _get(k.at, q))
-            lu, work = _set(lu, q, value), _set(work, _get(k.at, q), jnp.zeros_like(value))
-            return lu, work, jnp.maximum(largest, magnitude(value))
-
+        found = lax.fori_loop(begin, end, lambda g, found: _less_group(k, g, found), found)
         middle = _get(k.diagonal, i)
-        lu, work, largest = lax.fori_loop(middle, _get(k.start, i + 1), keep, (lu, work, largest))
-        return _set(lu, middle, 1 / _get(lu, middle)), work, _set(scales, i, scale), largest
+        lu, work, largest = lax.fori_loop(middle, _get(k.start, i + 1), lambda q, found: _kept(k, q, found), found)
+        return _Partial(_set(lu, middle, 1 / _get(lu, middle)), work, largest), _set(scales, i, scale)
 
-    n = k.rows.shape[0]
-    begin = jnp.zeros(k.at.shape, a.dtype), jnp.zeros(n, a.dtype), jnp.zeros(n, real), zero
-    lu, _, scale, largest = _for_each_row(n, row, begin)
+    nothing = _Partial(jnp.zeros(k.at.shape, a.dtype), jnp.zeros(n, a.dtype), zero)
+    (lu, _, largest), scale = _for_each_row(n, row, (nothing, jnp.zeros(n, real)))
     return Factors(lu, scale, largest)
+
+
+def _less_group(k: SymbolicLU, g: IntScalar, found: _Partial) -> Any:
+    """What is left of a row less the rows of U of a group of entries of L."""
+    p, together = _get(k.group, g), _get(k.is_many, g)
+    # Loops of one turn or none: what a branch gives would be copied.
+    found = lax.fori_loop(jnp.uint32(0), together, lambda _, found: _less_many(k, p, found), found)
+    return lax.fori_loop(together, jnp.uint32(1), lambda _, found: _less_one(k, p, found), found)
+
+
+def _less_one(k: SymbolicLU, p: IntScalar, found: _Partial) -> _Partial:
+    lu, work, largest = found
+    column = _get(k.at, p)
+    pivot = _get(k.diagonal, column)
+    factor = _get(work, column) * _get(lu, pivot)
+    subtract = lambda q, work: _add(work, _get(k.at, q), -factor * _get(lu, q))
+    work = _set(work, column, jnp.zeros_like(factor))
+    work = lax.fori_loop(pivot + 1, _get(k.start, column + 1), subtract, work)
+    return _Partial(_set(lu, p, factor), work, jnp.maximum(largest, magnitude(factor)))
+
+
+def _less_many(k: SymbolicLU, p: IntScalar, found: _Partial) -> _Partial:
+    lu, work, largest = found
+    column = _get(k.at, p)
+    pivots = [_get(k.diagonal, column + j) for j in range(TOGETHER)]
+    factors: list[Any] = []
+    for j, pivot in enumerate(pivots):
+        # In the row of U of pivot i the column of pivot j is j − i places after it.
+        others: Any = sum(f * _get(lu, pivots[i] + (j - i)) for i, f in enumerate(factors))
+        factors.append((_get(work, column + j) - others) * _get(lu, pivot))
+    # What follows the columns of these pivots, of each row.
+    places = [pivot + (TOGETHER - j) for j, pivot in enumerate(pivots)]
+
+    def subtract(q: IntScalar, work: Array) -> Array:
+        terms: Any = sum(f * _get(lu, place + (q - places[-1])) for f, place in zip(factors, places, strict=True))
+        return _add(work, _get(k.at, q), -terms)
+
+    for j, factor in enumerate(factors):
+        work, lu = _set(work, column + j, jnp.zeros_like(factor)), _set(lu, p + j, factor)
+        largest = jnp.maximum(largest, magnitude(factor))
+    return _Partial(lu, lax.fori_loop(places[-1], _get(k.start, column + TOGETHER), subtract, work), largest)
+
+
+def _kept(k: SymbolicLU, q: IntScalar, found: _Partial) -> _Partial:
+    """What is left of a row at an entry of U goes there."""
+    lu, work, largest = found
+    value = _get(work, _get(k.at, q))
+    lu, work = _set(lu, q, value), _set(work, _get(k.at, q), jnp.zeros_like(value))
+    return _Partial(lu, work, jnp.maximum(largest, magnitude(value)))
 
 
 @jit

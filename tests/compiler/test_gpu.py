@@ -115,7 +115,7 @@ def test_a_method_as_threads(method, gradient, monkeypatch, tmp_path, capsys):
 
 @pytest.mark.parametrize("part", range(PARTS))
 def test_programs_at_random(part, monkeypatch):
-    """As XLA has them; and PTX comes of them: an instruction that LLVM has not for GPUs would end the process."""
+    """As XLA has them, but for calls of the host; and PTX comes of them: what LLVM has no instruction for would end the process."""
 
     def compiled(jaxpr, lanes, copies):
         if not lanes:
@@ -127,7 +127,8 @@ def test_programs_at_random(part, monkeypatch):
 
     monkeypatch.setattr(check, "compiled", compiled)
     bundles = list(campaign.bundles(campaign.fixed()))[part::PARTS][:: int(os.environ.get("DAE_JAX_GPU_FUZZ", "4"))]
-    differing = [line for bundle in bundles for line in campaign.report(bundle)]
+    lines = [line for bundle in bundles for line in campaign.report(bundle)]
+    differing = [line for line in lines if "`pure_callback` runs on the host" not in line]
     assert not differing, "\n\n".join(differing)
 
 
