@@ -11,7 +11,7 @@ from ..consistent import unsolved, violation
 from ..equations.constraint_jacobian import Rank
 from ..equations.independent import Rows, independent
 from ..equations.mechanical import MechanicalODE
-from ..equations.regularity import DRIFTED, FEW, LARGE, VISIBLE, has_rank, is_near_constraints, mass_is_regular, weakest
+from ..equations.regularity import LARGE, bearable_drift, has_rank, is_near_constraints, mass_is_regular, weakest
 from ..systems import System, is_mechanism
 from ..types import Args, Scalar, State, Time
 
@@ -96,7 +96,6 @@ def _look_at_equations(
     consistent, off = at_start.consistent(), at_end.as_part()
     wrong = jnp.where(consistent, jnp.where(at_start.several, 4, 0), 1)
     rtol, atol = tolerances
-    much = jnp.minimum(DRIFTED * (rtol + atol), FEW * (rtol + atol) + VISIBLE)
-    drifted = (off > jnp.finfo(off.dtype).eps ** 0.5 + much) & (rtol + atol > 0)
+    drifted = (off > jnp.finfo(off.dtype).eps ** 0.5 + bearable_drift(rtol + atol, 1)) & (rtol + atol > 0)
     no = jnp.asarray(False)
     return Start(wrong, wrong == 0), End(~(off > LARGE), no, ~no, ~no, drifted)

@@ -16,14 +16,12 @@ from jax import lax
 from ..equations.manifold_ode import Equations
 from ..equations.mechanical import MechanicalODE
 from ..equations.regularity import mass_is_regular, passes_singularity
-from ..equations.structural_ode import StructuralODE
+from ..equations.structural_ode import ORIENTED, StructuralODE
 from ..systems import is_mechanism
 from ..types import BoolLike, BoolScalar, Time, Y
 from .problem import Problem
 
 
-# With more constraints a determinant takes longer than a step.
-MOST = 32
 # Relatively, the values of one determinant in a step in which its matrix jumps.
 ALIKE = 0.1
 
@@ -111,7 +109,7 @@ def passages(
         return None
     ode = MechanicalODE.of(system, t, state, args, problem.rank)
     masses = callable(system.mass) and not inverts_mass
-    return Passage(ode, decode, drifts, masses) if 0 < ode.holonomic + ode.nonholonomic <= MOST else None
+    return Passage(ode, decode, drifts, masses) if 0 < ode.holonomic + ode.nonholonomic <= ORIENTED else None
 
 
 def watched(controller: diffrax.AbstractStepSizeController, passage: Passage | Undetermined) -> "_AbstractWatchedSteps":

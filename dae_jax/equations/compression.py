@@ -43,15 +43,14 @@ class Compression:
         if GRADIENT * len(full) >= lengths.max(initial=0) - lengths[others].max(initial=0):
             full, others = full[:0], np.arange(m)
         colours = column_colouring(pattern[others])
-        count = int(colours.max(initial=-1)) + 1
         forward = colours[columns] * m + rows
-        backward = count * m + np.searchsorted(full, rows) * n + columns
+        backward = _count(colours) * m + np.searchsorted(full, rows) * n + columns
         return cls(colours, np.where(used, np.where(np.isin(rows, full), backward, forward), -1), full)
 
     @property
     def count(self) -> int:
         """How many colours there are."""
-        return int(self.colours.max(initial=-1)) + 1
+        return _count(self.colours)
 
     def jacobian(self, fn: Callable[[Flat], Flat], x: Float[Array, " n"]) -> Float[Array, "*stored"]:
         """The stored entries of ∂fn/∂x."""
@@ -68,6 +67,10 @@ class Compression:
         except ValueError:  # a loop that has no reverse mode
             entry = lambda j: jax.jvp(rows, (x,), (_unit(j, x),))[1]
             return jax.lax.map(entry, jnp.arange(x.size)).T
+
+
+def _count(colours: Int[np.ndarray, " n"]) -> int:
+    return int(colours.max(initial=-1)) + 1
 
 
 def _unit(j: IntScalar, x: Flat) -> Flat:

@@ -251,6 +251,11 @@ def _is_turned(product: Float[Array, "m m"], scale: Float[Array, " m"], rank: in
     return minor_sign(jax.lax.stop_gradient(product * scale[:, None] * scale), rank) < 0
 
 
+def bearable_drift(tolerance: Time, size: Time) -> Time:
+    """How far a solution of that size may be off what its method lets drift, and still be trusted."""
+    return jnp.minimum(DRIFTED * tolerance, FEW * tolerance + VISIBLE * size)
+
+
 def is_near_constraints(
     ode: MechanicalODE,
     t: Time,
@@ -280,9 +285,7 @@ def is_near_constraints(
         allowed = root * (1 + here) + by_tolerance + (0 if kept else LARGE * here)
         near = near & jnp.all(distance <= allowed)
         if not kept:
-            tolerance = atol + rtol * here
-            much = jnp.minimum(DRIFTED * tolerance, FEW * tolerance + VISIBLE * here)
-            drifted = drifted | jnp.any(distance > root * (1 + here) + much)
+            drifted = drifted | jnp.any(distance > root * (1 + here) + bearable_drift(atol + rtol * here, here))
     return near & _redundant_agree(ode, t, end, root), drifted & (rtol + atol > 0)
 
 

@@ -45,7 +45,7 @@ from .taylor import total_derivatives
 STARTING = 100
 # A selection of states is kept until its smallest pivot is less than this part of the best one's.
 HYSTERESIS = 0.3
-# With more equations a determinant takes longer than a step.
+# With more equations, or constraints, a determinant takes longer than a step.
 ORIENTED = 32
 # What of H may be round-off, in parts of its terms and of the resolution of numbers.
 OFF = 1000

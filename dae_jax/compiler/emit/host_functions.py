@@ -17,18 +17,17 @@ HOST = "dae_jax_host_1"
 
 @dataclasses.dataclass(frozen=True)
 class _Numbers:
-    """Arrays of one shape and type, one for each of `width` lanes, as machine code has them: the numbers of all lanes side by side, and
-    imaginary parts after all real ones.
+    """Arrays of one shape and type, one for each lane, as machine code has them: the numbers of all lanes side by side, and imaginary
+    parts after all real ones.
     """
 
     shape: tuple[int, ...]
     dtype: np.dtype
-    width: int
 
-    def at(self, address: int) -> np.ndarray:
-        """The memory there, with the parts of numbers first and the lanes last."""
+    def at(self, address: int, width: int) -> np.ndarray:
+        """The memory there of so many lanes, with the parts of numbers first and the lanes last."""
         parts, real = (2 if self.dtype.kind == "c" else 1), np.real(np.zeros((), self.dtype)).dtype
-        shape = (parts, *self.shape, self.width)
+        shape = (parts, *self.shape, width)
         memory: Any = (ctypes.c_char * (math.prod(shape) * real.itemsize)).from_address(address)
         return np.frombuffer(memory, real).reshape(shape)
 
@@ -50,10 +49,11 @@ class _Call:
     results: tuple[_Numbers, ...]
     width: int
 
-    def run(self, lanes: int, addresses: Sequence[int]) -> None:
-        count = len(self.arguments)
-        ins = [x.at(address) for x, address in zip(self.arguments, addresses[:count], strict=True)]
-        outs = [x.at(address) for x, address in zip(self.results, addresses[count:], strict=True)]
+    def run(self, lanes: int, addresses: int) -> None:
+        arrays, count = (*self.arguments, *self.results), len(self.arguments)
+        places = (ctypes.c_int64 * len(arrays)).from_address(addresses)
+        memory = [x.at(place, self.width) for x, place in zip(arrays, places, strict=True)]
+        ins, outs = memory[:count], memory[count:]
         for lane in (k for k in range(self.width) if lanes >> k & 1):
             for x, memory in zip(self.results, outs, strict=True):
                 x.write(memory, lane, np.nan if x.dtype.kind in "fc" else 0)
@@ -69,7 +69,7 @@ _places: dict[_Call, int] = {}
 
 def place(fn: Callable[..., Sequence[Any]], ins: Sequence[Aval], outs: Sequence[Aval], width: int) -> int:
     """The number by which machine code of `width` lanes calls a function of arrays like these, the same for equal functions."""
-    numbers = lambda avals: tuple(_Numbers(tuple(v.shape), np.dtype(v.dtype), width) for v in avals)
+    numbers = lambda avals: tuple(_Numbers(tuple(v.shape), np.dtype(v.dtype)) for v in avals)
     call = _Call(fn, numbers(ins), numbers(outs), width)
     if call not in _places:
         _calls.append(call)
@@ -82,6 +82,4 @@ def run(place: int, lanes: int, addresses: int) -> None:
     """Calls function number `place` in the lanes whose bits are set; `addresses`: of the memory of the arguments, then of the
     results. One that raises leaves NaN.
     """
-    call = _calls[place]
-    count = len(call.arguments) + len(call.results)
-    call.run(lanes, list((ctypes.c_int64 * count).from_address(addresses)))
+    _calls[place].run(lanes, addresses)

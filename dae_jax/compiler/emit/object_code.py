@@ -85,8 +85,7 @@ def object_code(
 
 def _gains_by_passes(text: str) -> bool:
     """Whether LLVM's passes gain more than they take."""
-    loops, turns = text.count(_LOOP), [int(last) for last in _TURNS.findall(text)]
-    longer = lambda least: sum(last >= least for last in turns)
+    loops, longer = text.count(_LOOP), lambda least: sum(int(last) >= least for last in _TURNS.findall(text))
     if text.count("\n") >= HEAVY or (loops > LOOPS and 2 * longer(VERY_LONG) < loops):
         return False
     addresses = text.count("getelementptr")
