@@ -3,6 +3,7 @@
 What passes through memory counts as different, since memory is kept for each lane.
 """
 
+import weakref
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,9 +20,20 @@ from .registry import RULES
 _UPDATES = frozenset({"maybe_set"})
 
 
+# A loop asks for its body at each turn of the search for a fixed point, and a loop within it at each turn of that.
+_known: weakref.WeakKeyDictionary[Jaxpr, dict[Any, list[bool]]] = weakref.WeakKeyDictionary()
+
+
 def varying(jaxpr: ClosedJaxpr | Jaxpr, inputs: Sequence[bool], in_memory: bool = True) -> list[bool]:
     """For each output whether it may; `in_memory`: what passes through memory does in any case."""
     jaxpr = jaxpr.jaxpr if isinstance(jaxpr, ClosedJaxpr) else jaxpr
+    known, key = _known.setdefault(jaxpr, {}), (*inputs, in_memory)
+    if key not in known:
+        known[key] = _varying(jaxpr, inputs, in_memory)
+    return known[key]
+
+
+def _varying(jaxpr: Jaxpr, inputs: Sequence[bool], in_memory: bool) -> list[bool]:
     found: dict[Any, bool] = dict(zip(jaxpr.invars, inputs, strict=True))
     read = lambda v: not isinstance(v, Literal) and found.get(v, False)
     for eqn in jaxpr.eqns:
