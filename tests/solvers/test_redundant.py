@@ -49,15 +49,17 @@ def test_follows_the_reference(name):
 @pytest.mark.parametrize("name", ["radau-ggl", "dummy-dop853"])
 def test_derivatives_and_batches(name):
     """Under `vmap` the start is traced, `rank` tells how many there are, and which ones is found in each lane."""
-    system = BARS.system
+    of = lambda rank: dae_jax.ConstrainedSystem(
+        lambda t, q, v, args: args[1] * BARS.system.force(t, q, v, args[0]),
+        lambda t, q, args: BARS.system.constraint(t, q, args[0]),
+        BARS.system.mass,
+        rank=rank,
+    )
 
-    def end(g, rank=None):
-        heavier = dae_jax.ConstrainedSystem(
-            lambda t, q, v, args: g * system.force(t, q, v, args), system.constraint, system.mass, rank=rank
-        )
-        return solve(heavier, name, BARS.y0, BARS.args, times=TIMES[:3]).ys[0][-1, 0]
+    def end_of(system, g):
+        return solve(system, name, BARS.y0, (BARS.args, g), times=TIMES[:3]).ys[0][-1, 0]
 
-    traced = functools.partial(end, rank=3)
+    end, traced = (functools.partial(end_of, of(rank)) for rank in (None, 3))
     gs, h = jnp.array([0.9, 1.0, 1.1]), 1e-3
     one_by_one = jnp.stack([end(g) for g in gs])
     np.testing.assert_allclose(jax.vmap(traced)(gs), one_by_one, atol=1e-8)
