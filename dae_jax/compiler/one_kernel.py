@@ -4,6 +4,7 @@ XLA:CPU runs a loop body as a sequence of kernels and pays for each launch; for 
 4 to 12 times the arithmetic.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
@@ -27,6 +28,7 @@ def one_kernel(
     derivative: Literal["forward", "reverse", "any"] = "any",
     pull_back: PullBack | None = None,
     forward: Callable[..., Any] | None = None,
+    seen: Callable[[Any], Array] | None = None,
 ) -> Callable[..., Any]:
     """`fn` (pytrees of arrays to a pytree of arrays), compiled to one kernel on the CPU or a GPU where it qualifies.
 
@@ -37,30 +39,38 @@ def one_kernel(
     - `pull_back(args, cotangent)`, with "reverse", gives the cotangents of those leaves of `args` that are inexact, where
       a way is known that has forward derivatives.
     - `forward`, with "reverse": the same function, with forward derivatives of any order, where `fn` has none.
+    - `seen(result)`, with "reverse": integers that say which way the computation went. Its derivatives, which round in another way,
+      get them as one more argument of `fn` and `forward`.
     """
     if not one_kernel_enabled() or derivative == "any":
         return fn
-    return _forward(fn) if derivative == "forward" else _reverse(fn, pull_back, forward or fn)
+    return _forward(fn) if derivative == "forward" else _reverse(fn, pull_back, forward or fn, seen)
 
 
-def _reverse(fn: Callable[..., Any], pull_back: PullBack | None, forward: Callable[..., Any]) -> Callable[..., Any]:
+def _reverse(
+    fn: Callable[..., Any],
+    pull_back: PullBack | None,
+    forward: Callable[..., Any],
+    seen: Callable[[Any], Array] | None,
+) -> Callable[..., Any]:
     def flat(*args: PyTree) -> Any:
         leaves, treedef = jax.tree.flatten(args)
-        kernel = as_kernel(fn)
+        kernel, args_of = as_kernel(fn), functools.partial(jax.tree.unflatten, treedef)
 
         @jax.custom_jvp
         def solve(*xs: Array) -> Any:
-            out, of_ys = jax.tree.flatten(kernel(*jax.tree.unflatten(treedef, xs)))
+            out, of_ys = jax.tree.flatten(kernel(*args_of(xs)))
             return jax.tree.unflatten(of_ys, batched_alike(*out))
 
         @solve.defjvp
         def _(xs: Sequence[Array], dxs: Sequence[Array]) -> Any:
             out = solve(*xs)
             ys, of_ys = jax.tree.flatten(out)
+            at, of_at = jax.tree.flatten(args_of(xs) if seen is None else (*args_of(xs), seen(out)))
             push = _derivative(
-                fn, pull_back, forward, treedef, list(map(is_inexact, xs)), of_ys, list(map(is_inexact, ys))
+                fn, pull_back, forward, of_at, list(map(is_inexact, at)), of_ys, list(map(is_inexact, ys))
             )
-            found = iter(push(xs, [dx for x, dx in zip(xs, dxs, strict=True) if is_inexact(x)], inexact(ys)))
+            found = iter(push(at, [dx for x, dx in zip(xs, dxs, strict=True) if is_inexact(x)], inexact(ys)))
             dys = [next(found) if is_inexact(y) else np.zeros(jnp.shape(y), jax.dtypes.float0) for y in ys]
             return out, jax.tree.unflatten(of_ys, dys)
 

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import optimistix
 from jax import lax
+from jaxtyping import Array, Float
 
 from .._compat import use_stepsize_tol
 from ..equations.manifold_ode import Equations, ManifoldODE
@@ -28,6 +29,7 @@ from ..solvers import (
 from ..types import Time, Y
 from .bracket import bracketing
 from .crossings import OneCrossing, OnStates
+from .followed_steps import at_steps, taken
 from .passages import passages, watched
 from .problem import Problem
 from .start import is_saved_part
@@ -63,8 +65,10 @@ class View(eqx.Module):
         return self.fn(t, self.decode(t, y, ode), self.args)
 
 
-def call(solve: "Solve", problem: Problem) -> tuple[Any, ...]:
-    """`diffrax.diffeqsolve` on what the formulation makes of the problem; the fields of its solution, and the end."""
+def call(solve: "Solve", problem: Problem, steps: Float[Array, " steps"] | None = None) -> tuple[Any, ...]:
+    """`diffrax.diffeqsolve` on what the formulation makes of the problem; the fields of its solution, the end, and the times of its
+    steps where they are needed. `steps`: the times to take steps at.
+    """
     t0, t1, dt0, args = problem.t0, problem.t1, problem.dt0, problem.args
     y, ode = solve.encoded(problem)
     decode = Decode(solve.formulation, solve.solver)
@@ -93,14 +97,16 @@ def call(solve: "Solve", problem: Problem) -> tuple[Any, ...]:
         }  # fmt: skip
         on_states = lambda c, up: OnStates(c, decode, args, direction, up, given)
         conditions = jax.tree.map(on_states, event.cond_fn, event.direction, is_leaf=lambda x: x is None or callable(x))
-        finder = bracketing(event.root_finder) if callable(event.cond_fn) else event.root_finder
-        event = dataclasses.replace(event, cond_fn=conditions, root_finder=finder)
+        event = dataclasses.replace(event, cond_fn=conditions, root_finder=bracketing(event.root_finder))
     saveat = dataclasses.replace(saveat, solver_state=True) if counts(solver) else saveat
     sums_errors = isinstance(controller, diffrax.ConstantStepSize) and not solve.recording
     controller = SummedErrors(controller) if sums_errors else controller
+    records = steps is None and solve.records_steps()
+    if steps is not None or records:
+        controller = at_steps(controller, steps, solve.max_steps)
     passage = passages(problem, ode, solve.formulation.decode, not solve.keeps()[0], solve.formulation.inverts_mass)
     controller = controller if passage is None else watched(controller, passage)
-    if sums_errors or passage is not None:
+    if sums_errors or records or passage is not None:
         saveat = dataclasses.replace(saveat, controller_state=True)
     sol = diffrax.diffeqsolve(
         solve.formulation.term(),
@@ -125,7 +131,8 @@ def call(solve: "Solve", problem: Problem) -> tuple[Any, ...]:
         state, (passed, determined, _) = state
         result = RESULTS.where((result == RESULTS.successful) & ~jnp.asarray(determined), RESULTS.undetermined, result)
     seen = state[-1] if sums_errors else None, passed
-    return sol.t0, sol.t1, ts["user"], ys["user"], interpolation, stats, result, sol.event_mask, seen, end
+    times = taken(state) if records else steps
+    return sol.t0, sol.t1, ts["user"], ys["user"], interpolation, stats, result, sol.event_mask, seen, end, times
 
 
 def _real(event: diffrax.Event | None, t: Time, y: Y, ode: Equations) -> list[OnStates]:

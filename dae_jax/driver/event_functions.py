@@ -6,6 +6,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix
 
 from ..structure import dependence_patterns
 from ..types import Args, BoolLike, State, Time
@@ -23,6 +24,11 @@ def refuse_wrong_event(event: diffrax.Event | Reset | None, t: Time, y: State, a
     for condition in conditions:
         # A boolean that stays true is no event of which there is one.
         _refuse_wrong_condition(condition, t, y, args, "f" if isinstance(event, Reset) else "fb")
+    if isinstance(event, diffrax.Event) and isinstance(event.root_finder, optimistix.Bisection) and len(conditions) > 1:
+        raise ValueError(
+            "diffrax finds the first of several events by `optimistix.Newton`, not by bisection. For that give one condition: the product "
+            "of these, or the least of them where they fall."
+        )
     if isinstance(event, Reset):
         _refuse_condition_in_steps(event.condition, t, y, args)
         _refuse_wrong_reset(event, t, y, args)

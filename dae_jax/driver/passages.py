@@ -19,6 +19,7 @@ from ..equations.regularity import mass_is_regular, passes_singularity
 from ..equations.structural_ode import ORIENTED, StructuralODE
 from ..systems import is_mechanism
 from ..types import BoolLike, BoolScalar, Time, Y
+from .followed_steps import AbstractStepsOf
 from .problem import Problem
 
 
@@ -170,21 +171,9 @@ class WatchedSteps(_AbstractWatchedSteps):
     direction: Any = 1
 
 
-class WatchedAdaptiveSteps(_AbstractWatchedSteps, diffrax.AbstractAdaptiveStepSizeController):
+class WatchedAdaptiveSteps(_AbstractWatchedSteps, AbstractStepsOf):
     """Steps of a controller with tolerances."""
 
     steps: Any
     passage: Passage | Undetermined
     direction: Any = 1
-
-    @property
-    def rtol(self) -> Any:
-        return self.steps.rtol
-
-    @property
-    def atol(self) -> Any:
-        return self.steps.atol
-
-    @property
-    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return self.steps.norm

@@ -9,10 +9,10 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from .._compat import is_captured, trace_state_clean
-from ..compiler import PullBack, inexact, one_kernel, waiting
+from ..compiler import PullBack, inexact, one_kernel, one_kernel_enabled, waiting
 from ..compiler.types import Arrays
 from ..equations.independent import independent
 from ..equations.regularity import COARSE
@@ -61,11 +61,21 @@ def _jitted(program: Program, arrays: Arrays) -> Any:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _numbers(program: Program, arrays: Arrays) -> Split:
+def _numbers(program: Program, arrays: Arrays, steps: Array | None = None) -> Split:
     """diffrax's part of a solve; jitted, so that derivatives and batches of it find it traced."""
     solve, problem = program.whole(arrays)
     with settled(program.leaves):
-        return Split.of(call(solve, problem))
+        return Split.of(call(solve, problem, None if steps is None else _as_times(steps)))
+
+
+def _of_steps(result: Split) -> Array:
+    """The times of the steps, as numbers without a derivative."""
+    times = result.numbers[-1]
+    return jax.lax.bitcast_convert_type(times, jnp.int64 if times.dtype == jnp.float64 else jnp.int32)
+
+
+def _as_times(bits: Array) -> Array:
+    return jax.lax.bitcast_convert_type(bits, jnp.float64 if bits.dtype == jnp.int64 else jnp.float32)
 
 
 def run(program: Program, arrays: Arrays) -> tuple[DAESolution, Any, float]:
@@ -113,7 +123,8 @@ class Solve:
         numbers, arrays = self.kernel(problem)
         forward, _ = self.forwards().kernel(problem)
         pull_back = self._pull_back(problem)
-        *fields, end = one_kernel(numbers, self.derivative(), pull_back, forward)(arrays).whole()
+        seen = _of_steps if self.records_steps() else None
+        *fields, end, _ = one_kernel(numbers, self.derivative(), pull_back, forward, seen)(arrays).whole()
         check, check_arrays = self._check(problem, end)
         # A yes or no has no derivative.
         found = one_kernel(check, self.derivative())(jax.lax.stop_gradient(check_arrays))
@@ -171,14 +182,14 @@ class Solve:
 
         return check, arrays
 
-    def kernel(self, problem: Problem) -> tuple[Callable[[list[Any]], Split], list[Any]]:
-        """What can become one kernel: a function of arrays, and its arrays."""
+    def kernel(self, problem: Problem) -> tuple[Callable[..., Split], list[Any]]:
+        """What can become one kernel: a function of arrays, and of the steps to take, if that is known; and its arrays."""
         program, arrays = split((self, problem))
 
-        def numbers(arrays: Arrays) -> Split:
+        def numbers(arrays: Arrays, *steps: Array) -> Split:
             # JAX's derivatives name the (empty) mesh, and would trace anew what was traced without a name for it.
             with jax.sharding.use_abstract_mesh(jax.sharding.get_abstract_mesh()):
-                return _numbers(program, arrays)
+                return _numbers(program, arrays, *steps)
 
         return numbers, arrays
 
@@ -234,6 +245,13 @@ class Solve:
         if isinstance(self.adjoint, diffrax.ForwardMode):
             return "forward"
         return "reverse" if isinstance(self.adjoint, diffrax.RecursiveCheckpointAdjoint) else "any"
+
+    def records_steps(self) -> bool:
+        """Whether what is saved belongs to steps whose sizes are chosen on the way, and has a derivative that is a program of its own."""
+        of_steps = self.saveat.dense or any(part.steps for part in saved_parts(self.saveat))
+        adaptive = isinstance(self.controller, diffrax.AbstractAdaptiveStepSizeController)
+        apart = self.derivative() == "reverse" and one_kernel_enabled() and not self.recording
+        return bool(of_steps and adaptive and apart)
 
     def between(self) -> bool:
         """Whether points between steps are asked for."""

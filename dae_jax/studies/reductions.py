@@ -21,14 +21,14 @@ def final_state(sol: DAESolution) -> Any:
 
 
 def largest_drift(system: System, sol: DAESolution) -> Float[Array, ""]:
-    """The largest of the levels of `drift` over the saved times, max |(g, ġ, h)| of a mechanism."""
-    return jnp.max(jnp.stack(drift(system, sol).levels))
+    """The largest of the levels of `drift` over the saved times, max |(g, ġ, h)| of a mechanism; infinite where the solve failed."""
+    return _where_it_went_well(sol, jnp.max(jnp.stack(drift(system, sol).levels)), jnp.inf)
 
 
 def energy_error(system: ConstrainedSystem, sol: DAESolution) -> Float[Array, ""]:
-    """max |E(t) − E(t₀)| over the saved times, in the unit of the energy; t₀ the first of them."""
+    """max |E(t) − E(t₀)| over the saved times, in the unit of the energy, t₀ the first of them; infinite where the solve failed."""
     total = energy(system, sol)
-    return jnp.max(jnp.abs(total - total[0]))
+    return _where_it_went_well(sol, jnp.max(jnp.abs(total - total[0])), jnp.inf)
 
 
 def largest_error(sol: DAESolution, reference: State) -> Float[Array, ""]:
@@ -39,8 +39,7 @@ def largest_error(sol: DAESolution, reference: State) -> Float[Array, ""]:
         return jnp.max(jnp.where(saved, jnp.abs(y - r), 0))
 
     error = jnp.max(jnp.stack(jax.tree.leaves(jax.tree.map(largest, sol.ys, reference))))
-    went_well = (sol.result == RESULTS.successful) | (sol.result == RESULTS.event_occurred)
-    return jnp.where(went_well, error, jnp.inf)
+    return _where_it_went_well(sol, error, jnp.inf)
 
 
 def first_time(ts: Float[Array, " times"], happened: Bool[Array, " times"]) -> Float[Array, ""]:
@@ -72,20 +71,30 @@ def lyapunov(
 
     δy is the derivative of the solution (tangent dynamics, by `jax.jvp`) in one direction, which is made consistent with
     the constraints and the hidden ones: `direction`, with the structure of `y0`, by default 1 everywhere. `options` are
-    those of `daesolve`.
+    those of `daesolve`, but for `event`, `saveat` and `adjoint`. NaN where a solve with `throw=False` failed.
+
+    Errors: `TypeError` for one of these three.
     """
+    for name in ("event", "saveat", "adjoint"):
+        if name in options:
+            raise TypeError(f"`lyapunov` takes no `{name}`: the exponent is that of the whole time from t0 to t1.")
     along = jax.tree.map(jnp.ones_like, y0) if direction is None else direction
     _, start = jax.jvp(lambda y: consistent_state(system, t0, y, args), (y0,), (along,))
 
-    def end(y: State) -> Any:
+    def end(y: State) -> tuple[Any, DAESolution]:
         sol = daesolve(
             system, solver, t0, t1, options.get("dt0"), y, args, adjoint=diffrax.ForwardMode(),
             **{name: value for name, value in options.items() if name != "dt0"},
         )  # fmt: skip
-        return final_state(sol)
+        return sol.final, sol
 
-    _, last = jax.jvp(end, (y0,), (start,))
-    return jnp.log(_norm(last) / _norm(start)) / (t1 - t0)
+    _, last, sol = jax.jvp(end, (y0,), (start,), has_aux=True)
+    return _where_it_went_well(sol, jnp.log(_norm(last) / _norm(start)) / (t1 - t0), jnp.nan)
+
+
+def _where_it_went_well(sol: DAESolution, value: Float[Array, ""], otherwise: float) -> Float[Array, ""]:
+    went_well = (sol.result == RESULTS.successful) | (sol.result == RESULTS.event_occurred)
+    return jnp.where(went_well, value, otherwise)
 
 
 def _norm(tree: PyTree) -> Float[Array, ""]:

@@ -19,7 +19,7 @@ def nested(depth, x):
 @pytest.mark.parametrize("depth", [2, 5, 8])
 def test_work_grows_with_the_depth_and_not_as_a_power(monkeypatch, depth):
     looked, within = [], uniformity._varying
-    monkeypatch.setattr(uniformity, "_varying", lambda *args: looked.append(args[0]) or within(*args))
+    monkeypatch.setattr(uniformity, "_varying", lambda *args: looked.append(args) or within(*args))
     closed = jax.make_jaxpr(functools.partial(nested, depth))((1.0, 2.0))
     assert uniformity.varying(closed, [True, False]) == [True, True]
     # Two inputs, a body and a condition for each loop; each with few combinations of what differs.

@@ -386,3 +386,11 @@ def test_the_time_at_which_a_solve_ends_has_its_derivative(adjoint):
         derivative(lambda h: fallen(h, 10.0, event))(1.3), 1 / np.sqrt(2 * GRAVITY * 1.3), rtol=1e-7
     )
     np.testing.assert_allclose(derivative(lambda t1: fallen(1.3, t1, None))(0.4), 1.0, rtol=1e-12)
+
+
+def test_bisection_of_several_conditions_is_refused():
+    conditions = [lambda t, y, args, **kwargs: y[0] - 0.5, lambda t, y, args, **kwargs: t - 2.0]
+    event = diffrax.Event(conditions, optimistix.Bisection(1e-9, 1e-9, flip="detect"))
+    decay = dae_jax.ImplicitDAE(lambda t, y, yd, args: yd + y)
+    with pytest.raises(ValueError, match="finds the first of several events by `optimistix.Newton`"):
+        dae_jax.daesolve(decay, dae_jax.RadauIIA5(), 0.0, 3.0, None, jnp.ones(1), event=event)

@@ -49,9 +49,11 @@ def test_follows_the_reference(name):
 @pytest.mark.parametrize("name", ["radau-ggl", "dummy-dop853"])
 def test_derivatives_and_batches(name):
     """Under `vmap` the start is traced, `rank` tells how many there are, and which ones is found in each lane."""
+    constraint = BARS.system.constraint
+    assert constraint is not None
     of = lambda rank: dae_jax.ConstrainedSystem(
         lambda t, q, v, args: args[1] * BARS.system.force(t, q, v, args[0]),
-        lambda t, q, args: BARS.system.constraint(t, q, args[0]),
+        lambda t, q, args: constraint(t, q, args[0]),
         BARS.system.mass,
         rank=rank,
     )

@@ -265,6 +265,27 @@ def test_lyapunov_exponent_is_the_growth_of_a_small_difference_in_minimal_coordi
     np.testing.assert_allclose(exponent, np.log(norm(grown) / norm(start)) / t1, rtol=1e-4)
 
 
+class TestOfASolveThatEndsEarly:
+    """Numbers of the whole time are no numbers of a part of it."""
+
+    FAILS = {"max_steps": 5, "throw": False}
+
+    def test_an_exponent_is_nan(self):
+        args = PENDULUM.system, PROJECTED, 0.0, 2.0, PENDULUM.y0
+        assert np.isfinite(reductions.lyapunov(*args))
+        assert np.isnan(reductions.lyapunov(*args, **self.FAILS))
+
+    def test_largest_values_are_infinite(self):
+        sol = dae_jax.daesolve(PENDULUM.system, PROJECTED, 0.0, 2.0, None, PENDULUM.y0, **self.FAILS)
+        assert reductions.largest_drift(PENDULUM.system, sol) == np.inf
+        assert reductions.energy_error(PENDULUM.system, sol) == np.inf
+
+    @pytest.mark.parametrize("name", ["event", "saveat", "adjoint"])
+    def test_what_ends_or_saves_early_is_refused(self, name):
+        with pytest.raises(TypeError, match=f"`lyapunov` takes no `{name}`"):
+            reductions.lyapunov(PENDULUM.system, PROJECTED, 0.0, 2.0, PENDULUM.y0, **{name: None})
+
+
 def test_what_is_not_traceable_is_refused_in_a_sentence():
     with pytest.raises(ValueError, match="`fn` must be traceable by JAX, but makes numbers of what it is given"):
         dae_jax.sweep(lambda angle: float(angle), np.linspace(0, 1, 3), progress=False)

@@ -26,10 +26,10 @@ _known: weakref.WeakKeyDictionary[Jaxpr, dict[Any, list[bool]]] = weakref.WeakKe
 
 def varying(jaxpr: ClosedJaxpr | Jaxpr, inputs: Sequence[bool], in_memory: bool = True) -> list[bool]:
     """For each output whether it may; `in_memory`: what passes through memory does in any case."""
-    jaxpr = jaxpr.jaxpr if isinstance(jaxpr, ClosedJaxpr) else jaxpr
-    known, key = _known.setdefault(jaxpr, {}), (*inputs, in_memory)
+    inner: Any = jaxpr.jaxpr if isinstance(jaxpr, ClosedJaxpr) else jaxpr
+    known, key = _known.setdefault(inner, {}), (*inputs, in_memory)
     if key not in known:
-        known[key] = _varying(jaxpr, inputs, in_memory)
+        known[key] = _varying(inner, inputs, in_memory)
     return known[key]
 
 

@@ -1,0 +1,149 @@
+"""Steps that are written down, and taken again.
+
+A derivative is a program of its own, which rounds in another way than the solve; where tolerances are tight, the two take steps of other
+sizes and, after hundreds of steps, not as many. Where what is saved belongs to steps (dense output, `SaveAt(steps=True)`), the derivative
+of the k-th step must be that of the step that the solution has there.
+"""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from ..types import IntScalar, Scalar
+
+
+class AbstractStepsOf(diffrax.AbstractAdaptiveStepSizeController):
+    """The steps of another controller with tolerances."""
+
+    steps: eqx.AbstractVar[Any]
+
+    @property
+    def rtol(self) -> Any:
+        return self.steps.rtol
+
+    @property
+    def atol(self) -> Any:
+        return self.steps.atol
+
+    @property
+    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return self.steps.norm
+
+
+class Record(NamedTuple):
+    """The controller's state, how many steps were accepted, and the times at their ends, that of the start first; then infinity."""
+
+    steps: Any
+    count: IntScalar
+    times: Float[Array, " steps"]
+
+
+class RecordedSteps(AbstractStepsOf):
+    """The steps of another controller, written down; `most` of them."""
+
+    steps: Any
+    most: int = eqx.field(static=True)
+
+    def wrap(self, direction: Any) -> "RecordedSteps":
+        return type(self)(self.steps.wrap(direction), self.most)  # pyright: ignore[reportCallIssue]
+
+    def init(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, error_order: Any
+    ) -> tuple[Any, Record]:
+        first, state = self.steps.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        return first, Record(state, jnp.asarray(0), jnp.full(self.most + 1, jnp.inf, t0.dtype).at[0].set(t0))
+
+    def adapt_step_size(
+        self,
+        t0: Any,
+        t1: Any,
+        y0: Any,
+        y1_candidate: Any,
+        args: Any,
+        y_error: Any,
+        error_order: Any,
+        controller_state: Record,
+    ) -> Any:
+        state, count, times = controller_state
+        keep, *rest, state, result = self.steps.adapt_step_size(
+            t0, t1, y0, y1_candidate, args, y_error, error_order, state
+        )
+        # In place: what is rejected is written over, or taken back at the end.
+        times = lax.dynamic_update_index_in_dim(times, lax.stop_gradient(t1), count + 1, 0)
+        return keep, *rest, Record(state, count + keep, times), result
+
+
+def at_steps(controller: Any, times: Float[Array, " steps"] | None, most: int | None) -> Any:
+    """Steps with their ends at these times; where they are not known yet those of the controller, at most so many, written down."""
+    recorded: Any = RecordedSteps
+    followed: Any = FollowedSteps
+    return recorded(controller, most) if times is None else followed(controller, times)
+
+
+def taken(record: Record) -> Float[Array, " steps"]:
+    """The times at the ends of the steps that were accepted, and infinity."""
+    return lax.stop_gradient(jnp.where(jnp.arange(record.times.size) <= record.count, record.times, jnp.inf))
+
+
+class _Followed(NamedTuple):
+    steps: Any
+    count: IntScalar
+    end: Scalar
+
+
+class FollowedSteps(AbstractStepsOf):
+    """Steps with their ends at `times`, all accepted. Like those of another controller they are moved by the start, and the last
+    one ends at t1.
+    """
+
+    steps: Any
+    times: Float[Array, " steps"]
+
+    def wrap(self, direction: Any) -> "FollowedSteps":
+        return type(self)(self.steps.wrap(direction), self.times)  # pyright: ignore[reportCallIssue]
+
+    def init(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, error_order: Any
+    ) -> tuple[Any, _Followed]:
+        _, state = self.steps.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        end = lax.stop_gradient(t1)
+        return self._after(jnp.asarray(0), t0, end), _Followed(state, jnp.asarray(0), end)
+
+    def adapt_step_size(
+        self,
+        t0: Any,
+        t1: Any,
+        y0: Any,
+        y1_candidate: Any,
+        args: Any,
+        y_error: Any,
+        error_order: Any,
+        controller_state: _Followed,
+    ) -> Any:
+        state, count, end = controller_state
+        keep, next_t0, _, made_jump, state, _ = self.steps.adapt_step_size(
+            t0, t1, y0, y1_candidate, args, y_error, error_order, state
+        )
+        count = count + 1
+        next_t0 = jnp.where(keep, next_t0, t1)
+        # A solve that failed goes no further.
+        goes_on = (t1 >= end) | jnp.isfinite(self.times[count + 1])
+        failed: Any = diffrax.RESULTS.dt_min_reached
+        result = diffrax.RESULTS.where(goes_on, diffrax.RESULTS.successful, failed)
+        return (
+            jnp.asarray(True),
+            next_t0,
+            self._after(count, next_t0, end),
+            made_jump,
+            _Followed(state, count, end),
+            result,
+        )
+
+    def _after(self, count: Int[Array, ""], t: Scalar, end: Scalar) -> Any:
+        """The end of the step that begins at t."""
+        following = self.times[count + 1]
+        return jnp.where(following >= end, jnp.inf, following + (t - lax.stop_gradient(t)))

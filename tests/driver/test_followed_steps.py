@@ -1,0 +1,88 @@
+"""What is saved of steps has the derivative of these very steps, whatever program computes it."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dae_jax
+
+
+# Motions from rest in another field are the same in another time.
+SYSTEM = dae_jax.ConstrainedSystem(lambda t, q, v, g: jnp.stack([0 * g, -g]), lambda t, q, g: (q @ q - 1) / 2)
+Y0 = (jnp.array([1.0, 0.0]), jnp.zeros(2))
+FIELD, END = 9.81, 3.0
+METHODS = {
+    "projection": (dae_jax.OrthogonalProjection(diffrax.Tsit5()), None),
+    "Radau": (dae_jax.RadauIIA5(), None),
+    "BDF": (dae_jax.BDF(), None),
+    "dummy derivatives": (dae_jax.DOP853(), dae_jax.DummyDerivatives()),
+}
+
+
+def solve(field, method, saveat, **options):
+    solver, formulation = METHODS[method]
+    options = {"stepsize_controller": diffrax.PIDController(rtol=1e-11, atol=1e-11), "max_steps": 2**13, **options}
+    return dae_jax.daesolve(
+        SYSTEM, solver, 0.0, END, None, Y0, field, formulation=formulation, saveat=saveat, **options
+    )
+
+
+def slope(t, sol_v):
+    """q at the time t depends on t √g alone."""
+    return t[:, None] * sol_v / (2 * FIELD)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_at_each_step(method):
+    def steps(field):
+        sol = solve(field, method, diffrax.SaveAt(steps=True))
+        return sol.ts, *sol.ys
+
+    (t, _, v), (_, dq, _) = jax.jvp(steps, (FIELD,), (1.0,))
+    reached = np.isfinite(t)
+    assert reached.sum() > 80
+    np.testing.assert_allclose(dq[reached], slope(t[reached], v[reached]), atol=3e-8)
+
+
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
+def test_of_dense_output(derivative):
+    times = jnp.linspace(0.1, END, 30)
+
+    def between(field):
+        sol = solve(field, "Radau", diffrax.SaveAt(dense=True), max_steps=2**14)
+        return jax.vmap(sol.evaluate)(times)
+
+    _, v = between(FIELD)
+    np.testing.assert_allclose(derivative(lambda g: between(g)[0])(FIELD), slope(times, v), atol=3e-8)
+
+
+STEPS = diffrax.PIDController(rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("case", ["backwards", "event", "jump", "batch"])
+def test_wherever_a_solve_ends(case):
+    """Backwards; at an event, within the last step; over a time that steps end at; in lanes of other numbers of steps."""
+    options = {
+        "event": {"event": diffrax.Event(lambda t, y, args, **kwargs: t - 0.77)},
+        "jump": {"stepsize_controller": diffrax.ClipStepSizeController(STEPS, jump_ts=jnp.array([0.3]))},
+    }.get(case, {})
+    t1, end = (-1.0, -1.0) if case == "backwards" else (1.0, 0.77) if case == "event" else (1.0, 1.0)
+    times = jnp.linspace(0.05, 1.0, 9) * end
+
+    def between(field):
+        sol = dae_jax.daesolve(
+            SYSTEM, dae_jax.OrthogonalProjection(diffrax.Tsit5()), 0.0, t1, None, Y0, field, max_steps=2**11,
+            saveat=diffrax.SaveAt(dense=True), **{"stepsize_controller": STEPS, **options},
+        )  # fmt: skip
+        return jax.vmap(sol.evaluate)(times)
+
+    fields = jnp.array([FIELD / 2, FIELD, 2 * FIELD]) if case == "batch" else jnp.array([FIELD])
+    slopes = (
+        jax.vmap(jax.jacrev(lambda g: between(g)[0]))(fields)
+        if case == "batch"
+        else [jax.jacrev(lambda g: between(g)[0])(FIELD)]
+    )
+    for field, found in zip(fields, slopes, strict=True):
+        np.testing.assert_allclose(found, times[:, None] * between(field)[1] / (2 * field), atol=1e-7)
