@@ -36,8 +36,8 @@ def jit(
 
     Under `jax.vmap` the elements of the batch become lanes of vectors, on all cores; on a GPU threads. Derivatives in either
     mode and of any order, as far as `fn` has them, are compiled in the same way, as programs of their own, which round differently:
-    of a solve with steps of its own choice save points at times, not at its steps, of which a derivative may take one more. Checks by `equinox.error_if` raise when the
-    kernel is done.
+    of a solve with steps of its own choice save points at times, not at its steps, of which a derivative may take one more. Checks by
+    `equinox.error_if` raise when the kernel is done.
     What cannot be one kernel is compiled by XLA as `jax.jit` does it, and so is everything on other backends;
     `jit(fn).lower(*args)` says which it is, and why.
     """

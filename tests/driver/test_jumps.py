@@ -392,5 +392,5 @@ def test_bisection_of_several_conditions_is_refused():
     conditions = [lambda t, y, args, **kwargs: y[0] - 0.5, lambda t, y, args, **kwargs: t - 2.0]
     event = diffrax.Event(conditions, optimistix.Bisection(1e-9, 1e-9, flip="detect"))
     decay = dae_jax.ImplicitDAE(lambda t, y, yd, args: yd + y)
-    with pytest.raises(ValueError, match="finds the first of several events by `optimistix.Newton`"):
+    with pytest.raises(ValueError, match="finds the first of several events by"):
         dae_jax.daesolve(decay, dae_jax.RadauIIA5(), 0.0, 3.0, None, jnp.ones(1), event=event)

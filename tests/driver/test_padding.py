@@ -50,8 +50,9 @@ def test_padding_is_the_last_value(name, batched):
             np.testing.assert_array_equal(a[saved:], np.broadcast_to(a[saved - 1], a[saved:].shape))
     for a, b in zip(jax.tree.leaves(one(many.final)), jax.tree.leaves(sol.ys), strict=True):
         np.testing.assert_array_equal(a, b[saved - 1])
-    assert reductions.largest_drift(SCENE.system, sol) == max(x.max() for x in dae_jax.drift(SCENE.system, sol))
-    assert np.isfinite(reductions.energy_error(SCENE.system, sol))
+    largest = np.inf if name == "failed" else max(x.max() for x in dae_jax.drift(SCENE.system, sol))
+    assert reductions.largest_drift(SCENE.system, sol) == largest
+    assert np.isfinite(reductions.energy_error(SCENE.system, sol)) == (name != "failed")
 
 
 def solve_at(shift, **options):

@@ -265,18 +265,19 @@ def test_lyapunov_exponent_is_the_growth_of_a_small_difference_in_minimal_coordi
     np.testing.assert_allclose(exponent, np.log(norm(grown) / norm(start)) / t1, rtol=1e-4)
 
 
+FAILS = {"max_steps": 5, "throw": False}
+
+
 class TestOfASolveThatEndsEarly:
     """Numbers of the whole time are no numbers of a part of it."""
-
-    FAILS = {"max_steps": 5, "throw": False}
 
     def test_an_exponent_is_nan(self):
         args = PENDULUM.system, PROJECTED, 0.0, 2.0, PENDULUM.y0
         assert np.isfinite(reductions.lyapunov(*args))
-        assert np.isnan(reductions.lyapunov(*args, **self.FAILS))
+        assert np.isnan(reductions.lyapunov(*args, **FAILS))
 
     def test_largest_values_are_infinite(self):
-        sol = dae_jax.daesolve(PENDULUM.system, PROJECTED, 0.0, 2.0, None, PENDULUM.y0, **self.FAILS)
+        sol = dae_jax.daesolve(PENDULUM.system, PROJECTED, 0.0, 2.0, None, PENDULUM.y0, **FAILS)
         assert reductions.largest_drift(PENDULUM.system, sol) == np.inf
         assert reductions.energy_error(PENDULUM.system, sol) == np.inf
 
