@@ -140,7 +140,7 @@ BREAKS = {
         f"{_COEFFICIENTS}::TestRadau::test_stages_are_predicted_on_the_last_polynomial",
     ),
     "Radau: way between, by the step before": Break(
-        "solvers/radau.py", "reach * (before - float(c))", "reach * (before + float(c))",
+        "solvers/radau_error.py", "reach * (before - float(c))", "reach * (before + float(c))",
         f"{_COEFFICIENTS}::TestRadau::test_what_the_start_of_the_step_before_says_of_the_way_between",
     ),
     "Radau: nodes": Break(

@@ -222,9 +222,14 @@ def ground_row(dimension: int) -> np.ndarray:
     return np.zeros(3) if dimension == 2 else np.array([0.0, 0, 0, 1, 0, 0, 0])
 
 
+def reference_row(body: Body | Ground, dimension: int) -> Float[Array, " k"]:
+    """The coordinates of a body in the reference configuration."""
+    return jnp.asarray(ground_row(dimension)) if isinstance(body, Ground) else body.reference[0]
+
+
 def reference_pose(body: Body | Ground, dimension: int) -> Pose:
-    """Where a body is in the reference configuration."""
-    return pose(jnp.asarray(ground_row(dimension)) if isinstance(body, Ground) else body.reference[0])
+    """Where it is there."""
+    return pose(reference_row(body, dimension))
 
 
 def numbers(value: Numbers) -> Array:

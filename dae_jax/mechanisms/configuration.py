@@ -7,10 +7,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from .bodies import Body, Ground, Pose, Twist, dimension, ground, ground_row, pose, reference_pose, twist
-from .rotations import rotate
+from .bodies import Body, Ground, Pose, Twist, dimension, ground, ground_row, pose, reference_row, twist
+from .rotations import conjugate, product, rotate
 
 
 Kind = Literal["angle", "displacement", "distance"]
@@ -75,22 +75,22 @@ class Configuration:
         return jnp.asarray(np.arange(len(self.q.names)) == self.row(name), row.dtype)[:, None] * row
 
 
-MarkerArrays: TypeAlias = tuple[Float[Array, " d"], Float[Array, "d d"], Float[Array, ""]]
+MarkerArrays: TypeAlias = tuple[Float[Array, " d"], Float[Array, "d d"], Float[Array, "..."]]
 
 
 class Marker(eqx.Module):
-    """A point of a body, and a frame there whose columns are its axes, in body axes; in the plane also the body's angle in the
-    reference configuration, whose turns a frame does not know.
+    """A point of a body, and a frame there whose columns are its axes, in body axes; and how the body is turned in the reference
+    configuration, by its angle in the plane, whose turns a frame does not know, and by its quaternion in space, which knows one.
     """
 
     body: str = eqx.field(static=True)
     point: Float[Array, " d"]
     frame: Float[Array, "d d"]
-    angle: Float[Array, ""]
+    reference: Float[Array, "..."]
 
     def moved_to(self, point: Float[Array, " d"]) -> "Marker":
         """The same axes at another point of the body."""
-        return Marker(self.body, point, self.frame, self.angle)
+        return Marker(self.body, point, self.frame, self.reference)
 
     def position(self, at: Configuration) -> Float[Array, " d"]:
         """The point in the world."""
@@ -98,8 +98,8 @@ class Marker(eqx.Module):
 
     @property
     def arrays(self) -> MarkerArrays:
-        """Point, frame and angle."""
-        return self.point, self.frame, self.angle
+        """Point, frame and reference."""
+        return self.point, self.frame, self.reference
 
     def axis(self, at: Configuration, column: int) -> Float[Array, " d"]:
         """An axis of the frame, in world axes."""
@@ -167,6 +167,16 @@ def value(
     return jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1)), 0)
 
 
+def is_within_half_a_turn(
+    q_a: Float[Array, " k"], q_b: Float[Array, " k"], on_a: MarkerArrays, on_b: MarkerArrays
+) -> Bool[Array, ""]:
+    """Whether b has turned in space by less than half a turn against a, about the z axis of a's frame, since the reference
+    configuration. Beyond it is false for another full turn: quaternions on the way do not jump.
+    """
+    turned_a, turned_b = (product(q[3:], conjugate(on[2])) for q, on in ((q_a, on_a), (q_b, on_b)))
+    return product(conjugate(turned_a), turned_b)[0] > 0
+
+
 def axis_of(dimension: int) -> int:
     """The column of a joint's frame that is its axis: x in the plane, z in space."""
     return 0 if dimension == 2 else 2
@@ -174,10 +184,11 @@ def axis_of(dimension: int) -> int:
 
 def marker(body: Body | Ground, point: Float[Array, " d"], frame: Float[Array, "d d"]) -> Marker:
     """The marker that is at a point of the world, with these axes, in the reference configuration."""
-    return Marker(body.name, *_in_body_axes(reference_pose(body, point.shape[0]), point, frame))
+    row = reference_row(body, point.shape[0])
+    reference = row[2] if point.shape[0] == 2 else row[3:]
+    return Marker(body.name, *_in_body_axes(pose(row), point, frame), reference)
 
 
 @functools.partial(jax.jit, inline=True)
-def _in_body_axes(place: Pose, point: Float[Array, " d"], frame: Float[Array, "d d"]) -> MarkerArrays:
-    axes = jnp.sum(place.rotation[:, :, None] * frame[:, None, :], 0)
-    return place.local(point), axes, jnp.zeros(()) if place.angle is None else place.angle
+def _in_body_axes(place: Pose, point: Float[Array, " d"], frame: Float[Array, "d d"]) -> tuple[Array, Array]:
+    return place.local(point), jnp.sum(place.rotation[:, :, None] * frame[:, None, :], 0)

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from ..types import Args, Scalar, Time
 from .bodies import Body, Numbers, generalised, numbers, pose
-from .configuration import Configuration, Coordinate, MarkerArrays, value
+from .configuration import Configuration, Coordinate, MarkerArrays, is_within_half_a_turn, value
 from .contacts import Motion
 from .joints import AbstractJoint, only_coordinate
 from .laws import HALF_TURN, Drive, Friction, Law, Spring
@@ -63,6 +63,11 @@ class Along(AbstractLoad):
     coordinate: Coordinate
     law: Law
 
+    @property
+    def counts_turns(self) -> bool:
+        """Whether half a turn in space must not be passed."""
+        return isinstance(self.law, Spring) and self.law.is_turn
+
     def effort(self, t: Time, at: Configuration, args: Args) -> Scalar:
         """τ."""
         return self.law.effort(t, *self.coordinate.with_rate(at), args)
@@ -89,6 +94,9 @@ def along(loads: Sequence[Along], t: Time, at: Configuration, args: Args) -> Flo
 
     u, q = at.velocities, at.rows
     c, rate, slopes = jax.vmap(one)((q[a], q[b]), (u[a], u[b]), (on_a, on_b))
+    if any(load.counts_turns for load in loads):
+        counts = np.array([load.counts_turns for load in loads])
+        c = jnp.where(jax.vmap(is_within_half_a_turn)(q[a], q[b], on_a, on_b) | ~counts, c, jnp.nan)
     efforts = jnp.stack([load.law.effort(t, c[k], rate[k], args) for k, load in enumerate(loads)])
     total = jnp.zeros_like(at.q.values)
     for rows, slope in zip((a, b), slopes, strict=True):
@@ -140,7 +148,8 @@ def spring(
     - `rest`: c₀, in m or rad.
 
     An angle in space is within (−π, π] of the reference configuration, and its turns are not known: a solve in which one with a
-    spring comes near half a turn fails. In the plane turns count.
+    spring comes near half a turn fails, also where a step leaps over it; quaternions of a state that is put together by hand have
+    the sign that they get on the way from there. In the plane turns count.
 
     Errors: `ValueError` where the rest of an angle in space is half a turn off or more.
     """

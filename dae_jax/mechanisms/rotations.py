@@ -76,3 +76,21 @@ def quaternion(axis: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Array,
     """The unit quaternion of a turn by an angle in rad about an axis."""
     unit = axis / jnp.sqrt(jnp.sum(axis**2))
     return jnp.concatenate([jnp.cos(angle / 2)[None], jnp.sin(angle / 2) * unit])
+
+
+def conjugate(e: Float[Array, "4"]) -> Float[Array, "4"]:
+    """The quaternion of the turn back."""
+    return jnp.concatenate([e[:1], -e[1:]])
+
+
+def product(a: Float[Array, "4"], b: Float[Array, "4"]) -> Float[Array, "4"]:
+    """The quaternion of the turn a after the turn b."""
+    (w, x, y, z), (p, q, r, s) = a, b
+    return jnp.stack(
+        [
+            w * p - x * q - y * r - z * s,
+            w * q + x * p + y * s - z * r,
+            w * r - x * s + y * p + z * q,
+            w * s + x * r - y * q + z * p,
+        ]
+    )

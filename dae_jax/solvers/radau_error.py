@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from .radau_coefficients import Coefficients
 from .radau_step import Step, along
 from .residual_steps import Tolerances
 
@@ -24,7 +25,7 @@ def error_of_step(
     shown, always = linearised.form.shown, linearised.between(dense)
     if not shown.any():
         return filtered
-    polynomial = _between(step, past, z) * linearised.weights(step.h, tol.raised())
+    polynomial = _between(step.method, past, step.h, z) * linearised.weights(step.h, tol.raised())
     counted = polynomial * always
     if (shown & ~always).any():
         doubted = shown & (jnp.abs(once) >= tol.scale(*ends)) & (tol.norm(filtered, *ends) < 1)
@@ -53,13 +54,13 @@ def _embedded(step: Step, factor: Any, z: Any, tol: Tolerances) -> tuple[Float[A
     return once * weights, error * weights
 
 
-def _between(step: Step, past: Any, z: Float[Array, "s n"]) -> Float[Array, " n"]:
+def _between(method: Coefficients, past: Any, h: Any, z: Float[Array, "s n"]) -> Float[Array, " n"]:
     """The largest error of the polynomial through the step's points, by the start of the step before."""
     none = past.h == 0
     # 1 where there was none, which is as good as any.
-    before = reach = -jnp.where(none, 1, past.h / step.h)
-    for c in step.method.nodes:
+    before = reach = -jnp.where(none, 1, past.h / h)
+    for c in method.nodes:
         reach = reach * (before - float(c))
     off = along(z, before) + past.z[-1]
-    at_start = sum(float(c) * z[i] for i, c in enumerate(step.method.at_start))
-    return jnp.where(none, at_start, off * (step.method.between / reach))
+    at_start = sum(float(c) * z[i] for i, c in enumerate(method.at_start))
+    return jnp.where(none, at_start, off * (method.between / reach))

@@ -51,6 +51,30 @@ def test_a_spring_fails_at_half_a_turn_and_is_right_before():
         solve(1.5)
 
 
+@pytest.mark.parametrize("axis", [(0, 0, 1), (1, 2, -2)])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_spring_fails_where_a_step_leaps_over_half_a_turn(axis, sign):
+    """Steps of 0.6 rad a stage, by a tolerance that the turning allows; also of a body that is turned at the start."""
+    body = m.Body("wheel", 1.0, (1.0, 1.0, 1.0), orientation=(0.5, 0, 0.8, 0.3))
+    hinge = m.revolute(m.ground, body, (0, 0, 0), axis=axis, name="hinge")
+    mechanism = m.Mechanism([body], [hinge], [m.spring(hinge, 1.0)])
+    steps = diffrax.PIDController(rtol=1e-3, atol=1e-3)
+    solve = lambda rate, t1: dae_jax.daesolve(
+        mechanism.system(),
+        SOLVER,
+        0.0,
+        t1,
+        None,
+        mechanism.assemble(rates={"hinge": sign * rate}),
+        stepsize_controller=steps,
+    )
+    swings = solve(2.5, 2.0)
+    np.testing.assert_allclose(mechanism.coordinate(swings, "hinge")[-1], sign * 2.5 * np.sin(2.0), atol=0.05)
+    for rate in (30.0, 100.0, 300.0):
+        with pytest.raises(RuntimeError, match="is not finite just beyond"):
+            solve(rate, 20.0 / rate)
+
+
 @pytest.mark.parametrize(("ratio", "b"), [(2.0, 3.5), (-1.0, 4.0), (0.5, 3.5)])
 def test_gears_of_whole_ratios_turn_on(ratio, b):
     other = m.Body("other", 1.0, (0.1, 0.1, 0.1), at=(0, 3, 0))

@@ -10,7 +10,7 @@ import pytest
 import dae_jax
 from dae_jax.equations.linearised import LinearisedResidual
 from dae_jax.equations.residual_form import ResidualForm
-from dae_jax.solvers import bdf, dop853, dop853_coefficients as dop, radau
+from dae_jax.solvers import bdf, dop853, dop853_coefficients as dop, radau, radau_error
 from dae_jax.solvers.radau_coefficients import coefficients
 from dae_jax.solvers.radau_step import Step, along
 from dae_jax.solvers.residual_steps import tolerances
@@ -170,7 +170,7 @@ class TestRadau:
         power = lambda x: (x + before) ** (s + 1) - before ** (s + 1)
         last = np.polynomial.Polynomial([*[0.0] * (s + 1), 1.0])(before * method.nodes)
         state = radau.RadauState(jnp.asarray(last[:, None]), jnp.asarray(before), *[None] * 7)
-        found = radau._between(method, state, jnp.asarray(h), jnp.asarray(power(h * method.nodes)[:, None]))
+        found = radau_error._between(method, state, jnp.asarray(h), jnp.asarray(power(h * method.nodes)[:, None]))
         np.testing.assert_allclose(np.abs(found), method.between * h ** (s + 1), rtol=1e-8)
 
 
