@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.sparse import csr_array
 
+from ._compat import at_ease
 from .equations.derivative_orders import Offsets, find_offsets
 from .equations.residual_form import ResidualForm
 from .equations.slopes import Slopes
@@ -210,6 +211,7 @@ class Structure:
         return (f"[{mark}]" if self.transversal[i] == j else f" {mark}").ljust(4)
 
 
+@at_ease
 def analyse(system: System, t0: Time, y0: State, args: Args = None) -> Structure:
     """The structure of a system: index, offsets, degrees of freedom, hidden constraints.
 

@@ -9,6 +9,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, PyTree
 
+from ._compat import at_ease
 from .equations.constraint_jacobian import dense_mass, mass_solve
 from .equations.initial_rates import is_nonlinear, rates_of
 from .equations.linearised import LinearisedResidual
@@ -122,6 +123,7 @@ def _left_over(ode: StructuralODE, t: Time, y: Float[Array, " N"]) -> Unsolved:
     return Unsolved(ode.violations(t, y), jnp.finfo(y.dtype).eps ** 0.5 * terms, ode.invariant_names)
 
 
+@at_ease
 def consistent_state(
     system: System,
     t0: Time,

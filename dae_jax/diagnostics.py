@@ -15,6 +15,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from ._compat import at_ease
 from .equations.constraint_jacobian import Rank, dense_mass
 from .equations.mechanical import MechanicalODE
 from .equations.regularity import mass_is_regular, mass_message, rank_message, redundancy
@@ -51,6 +52,7 @@ def drift(system: ConstrainedSystem, sol: DAESolution) -> Drift: ...
 def drift(system: SemiExplicitDAE | ImplicitDAE, sol: DAESolution) -> EquationDrift: ...
 
 
+@at_ease
 def drift(system: System, sol: DAESolution) -> Drift | EquationDrift:
     """How far each saved state is off the constraints, and off the hidden ones.
 
@@ -67,6 +69,7 @@ def drift(system: System, sol: DAESolution) -> Drift | EquationDrift:
     return Drift(*_at_saved_times(system, sol, _largest))
 
 
+@at_ease
 def energy(system: ConstrainedSystem, sol: DAESolution) -> Float[Array, " times"]:
     """½ vᵀM v + V(q) at each saved time.
 
@@ -88,6 +91,7 @@ def multipliers(
 ) -> Float[Array, " mp"]: ...
 
 
+@at_ease
 def multipliers(system: ConstrainedSystem, *at: Any) -> Any:
     """(λ, μ): the constraint forces are −Gᵀλ − Hᵀμ. Of least norm where constraints are redundant.
 

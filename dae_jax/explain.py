@@ -13,6 +13,7 @@ from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array, Float, PyTree
 
+from ._compat import at_ease
 from .compiler import Decision, decision, equations, one_kernel_enabled, without_checks
 from .driver.program import Solve
 from .driver.start import refuse_bad_start, refuse_no_time
@@ -179,6 +180,7 @@ class ResidualPlan(Plan):
         }
 
 
+@at_ease
 def explain(
     system: System,
     solver: Solver,

@@ -11,7 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree, Real
 
-from ._compat import messages
+from ._compat import at_ease, messages
 from .tables import table
 from .types import Args, DType, State, Time
 
@@ -121,6 +121,7 @@ class Interpolation(eqx.Module):
     decode: Callable[..., Any]
     ode: Any
 
+    @at_ease
     def evaluate(self, t0: Time, t1: Time | None = None, left: bool = True) -> Any:
         """The state at `t0`, or its increment from `t0` to `t1`."""
         if t1 is not None:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from ._compat import at_ease
 from .compiler.types import Arrays
 from .driver.doubts import warn
 from .driver.event_functions import refuse_other_outputs
@@ -43,6 +44,7 @@ _of_known_rank: dict[Program, Program] = {}
 _with_few: set[int] = set()
 
 
+@at_ease
 def daesolve(
     system: System,
     solver: Solver,

@@ -3,8 +3,10 @@
 Beside it XLA's interface for foreign functions, which has a version (`emit/interface.py`).
 """
 
+import functools
 import inspect
-from typing import Any
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar
 
 import jax
 import numpy as np
@@ -12,6 +14,36 @@ from jax._src import xla_bridge
 from jax.interpreters.partial_eval import dce_jaxpr as dce_jaxpr
 
 from .types import Aval, Equation, Params
+
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+# What JAX lets users forbid for their own code, and what it is by default.
+_STRICT = {
+    "jax_numpy_rank_promotion": ("allow",),
+    "jax_numpy_dtype_promotion": ("standard",),
+    "jax_transfer_guard_host_to_device": (None, "allow"),
+    "jax_transfer_guard_device_to_host": (None, "allow"),
+    "jax_transfer_guard_device_to_device": (None, "allow"),
+}
+
+
+def at_ease(fn: Callable[P, T]) -> Callable[P, T]:
+    """`fn` by the default rules of JAX for promotion and transfers, whatever its caller has set for code of his own."""
+
+    @functools.wraps(fn)
+    def eased(*args: P.args, **kwargs: P.kwargs) -> T:
+        if all(getattr(jax.config, name) in usual for name, usual in _STRICT.items()):
+            return fn(*args, **kwargs)
+        with (
+            jax.numpy_rank_promotion("allow"),
+            jax.numpy_dtype_promotion("standard"),
+            jax.transfer_guard("allow"),
+        ):
+            return fn(*args, **kwargs)
+
+    return eased
 
 
 def setting(name: str) -> bool:

@@ -20,7 +20,7 @@ from jax.interpreters import batching, mlir
 from jaxtyping import Array, PyTree
 
 from . import fallbacks, lower, waiting, xla_kernel
-from ._compat import dce_jaxpr, setting
+from ._compat import at_ease, dce_jaxpr, setting
 from .check import checked
 from .jaxprs.expansions import expanded, kernel_written_out
 from .jaxprs.scalar_interpreter import Unsupported
@@ -146,6 +146,7 @@ def _(*args: Array, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> Any:
     return [v.aval.update(shape=(*lead, *v.aval.shape)) for v in jaxpr.jaxpr.outvars]
 
 
+@at_ease
 def _lower(*args: Array, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], on_gpu: bool) -> list[Any]:
     began = waiting.begin()
     try:
@@ -204,6 +205,7 @@ for _platform in ("cpu", "cuda"):
 mlir.register_lowering(kernel_p, mlir.lower_fun(kernel_written_out, multiple_results=True))
 
 
+@at_ease
 def _batch(
     args: Sequence[Array], dims: Sequence[int | None], *, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]
 ) -> tuple[list[Any], list[Any]]:

@@ -18,6 +18,7 @@ from jax.interpreters import ad, batching, mlir
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
+from ._compat import at_ease
 from .kernel_call import as_kernel
 
 
@@ -140,6 +141,7 @@ linear_p = Primitive("linear_map")
 linear_p.multiple_results = True
 
 
+@at_ease
 def _evaluate(*args: Array, of: LinearMap, **_: object) -> Arrays:
     n = len(of.inexact)
     return of.apply(list(args[:n]), list(args[n:]))
@@ -150,6 +152,7 @@ linear_p.def_abstract_eval(lambda *_, avals, **__: list(avals))
 mlir.register_lowering(linear_p, mlir.lower_fun(_evaluate, multiple_results=True))
 
 
+@at_ease
 def _jvp(primals: Arrays, tangents: Sequence[Array], *, of: LinearMap, avals: Sequence[ShapedArray]) -> Any:
     n = len(of.inexact)
     changes = [t for t, i in zip(tangents[:n], of.inexact, strict=True) if i]
@@ -169,11 +172,13 @@ def _instantiated(tangents: Sequence[Array]) -> Arrays:
     return [jnp.zeros(t.aval.shape, t.aval.dtype) if _is_zero(t) else t for t in tangents]
 
 
+@at_ease
 def _transpose(cotangents: Arrays, *args: Array, of: LinearMap, **_: object) -> list[Any]:
     n = len(of.inexact)
     return [None] * n + of.transposed()(args[:n], _instantiated(cotangents), [x.aval for x in args[n:]])
 
 
+@at_ease
 def _batch(args: Sequence[Array], axes: Axes, *, of: LinearMap, avals: Sequence[ShapedArray]) -> Any:
     args = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(args, axes, strict=True)]
     axes, n = [None if d is None else 0 for d in axes], len(of.inexact)

@@ -76,7 +76,7 @@ def _refuse_bad_tolerances(controller: object) -> None:
         return
     leaves = jax.tree.leaves(given)
     fine = all(isinstance(x, NUMBERS) and np.all(np.asarray(x) >= 0) for x in leaves)
-    if not fine or not any(np.any(x) for x in leaves):
+    if not fine or not any(np.any(np.asarray(x)) for x in leaves):
         raise ValueError(
             "`stepsize_controller` must have positive tolerances, but has "
             f"rtol = {brief(given[0])} and atol = {brief(given[1])}: write PIDController(rtol=1e-6, atol=1e-6)."

@@ -38,11 +38,13 @@ def checked(system: System, t0: Time, t1: Time, dt0: Time | None, y0: State, arg
         if value is not None or name != "dt0":
             refuse_no_time(name, value)
     if dt0 is not None and not any(isinstance(x, Tracer) for x in (t0, t1, dt0)):
-        if dt0 == 0:
+        # In `jit`, what JAX makes of arrays that are known is not.
+        start, end, step = map(np.asarray, (t0, t1, dt0))
+        if step == 0:
             raise ValueError(
                 "`dt0` must be a step, or None for steps that are chosen, but is 0: the order is t0, t1, dt0, y0."
             )
-        if (t1 - t0) * dt0 < 0:
+        if (end - start) * step < 0:
             raise ValueError(f"`dt0` = {dt0} points away from `t1` = {t1}: it must have the sign of t1 − t0.")
     dtype = jnp.result_type(*jax.tree.leaves(y0))
     _refuse_times_of_one_number(t0, t1, dtype)
@@ -52,7 +54,7 @@ def checked(system: System, t0: Time, t1: Time, dt0: Time | None, y0: State, arg
 
 def _refuse_times_of_one_number(t0: Time, t1: Time, dtype: DType) -> None:
     """Refuses an interval that has no length in the numbers of the state."""
-    if any(isinstance(x, Tracer) for x in (t0, t1)) or t0 == t1:
+    if any(isinstance(x, Tracer) for x in (t0, t1)) or np.asarray(t0) == np.asarray(t1):
         return
     if np.asarray(t0, dtype) == np.asarray(t1, dtype):
         raise ValueError(
@@ -82,14 +84,15 @@ def refuse_bad_times(saveat: diffrax.SaveAt, t0: Time, t1: Time) -> None:
     for sub in saved_parts(saveat):
         if sub.ts is not None and not any(isinstance(x, Tracer) for x in (sub.ts, t0, t1)):
             ts = np.asarray(sub.ts)
-            low, high = min(t0, t1), max(t0, t1)
+            start, end = np.asarray(t0), np.asarray(t1)
+            low, high = min(start, end), max(start, end)
             if ts.ndim != 1 or not np.all(np.isfinite(ts)):
                 raise ValueError(f"`saveat.ts` must be a vector of finite times, but is {brief(sub.ts)}.")
             if ts.size and (ts.min() < low or ts.max() > high):
                 raise ValueError(
                     f"`saveat.ts` must lie between t0 = {t0} and t1 = {t1}, but spans {ts.min()} to {ts.max()}."
                 )
-            steps = np.diff(ts) * (1 if t1 >= t0 else -1)
+            steps = np.diff(ts) * (1 if end >= start else -1)
             if np.any(steps < 0):
                 raise ValueError("`saveat.ts` must be in the order in which the solve passes them.")
 

@@ -251,7 +251,7 @@ def _refuse_no_mass(body: Body) -> None:
         value = getattr(body, what)
         if not isinstance(value, Tracer) and not np.all(np.isfinite(value)):
             raise ValueError(f"Body {body.name!r}: `{what}` is not finite: {np.asarray(value).tolist()}.")
-    if not isinstance(body.mass, Tracer) and not body.mass > 0:
+    if not isinstance(body.mass, Tracer) and not np.asarray(body.mass) > 0:
         raise ValueError(f"Body {body.name!r} has the mass {float(body.mass):g}, and must have a positive one.")
     if isinstance(body.inertia, Tracer):
         return

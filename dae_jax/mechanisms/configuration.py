@@ -186,7 +186,8 @@ def marker(body: Body | Ground, point: Float[Array, " d"], frame: Float[Array, "
     """The marker that is at a point of the world, with these axes, in the reference configuration."""
     row = reference_row(body, point.shape[0])
     reference = row[2] if point.shape[0] == 2 else row[3:]
-    return Marker(body.name, *_in_body_axes(pose(row), point, frame), reference)
+    place, axes = _in_body_axes(pose(row), point, frame)
+    return Marker(body.name, place, axes, reference)
 
 
 @functools.partial(jax.jit, inline=True)

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
@@ -168,13 +169,15 @@ def coupling(
     label, a = f"coupling of {one.name}" if name is None else name, jnp.atleast_1d(numbers(coefficients))
     a = _without_zeros(a)
     if two is not None and two.is_turn and len(a) > 1:
-        whole = lambda x: not isinstance(x, Tracer) and abs(x - round(float(x))) < WHOLE
-        if len(a) > 2 or (one.is_turn and not (whole(a[1]) or whole(1 / a[1]))):
+        ratio = None if isinstance(a, Tracer) else float(np.asarray(a)[1])
+        whole = lambda x: abs(x - round(x)) < WHOLE
+        follows, leads = (False, False) if ratio is None else (whole(ratio), ratio != 0 and whole(1 / ratio))
+        if len(a) > 2 or (one.is_turn and not (follows or leads)):
             raise ValueError(
                 f"Joint {label!r}: {two.name!r} has an angle in space, whose turns are not known: its powers, and multiples that are "
                 "not whole (or 1 over a whole number), would change with each. In the plane any will do."
             )
-        if not (one.is_turn and whole(a[1])):
+        if not (one.is_turn and follows):
             # c₂ = (c₁ − a₀)/a₁ is the same, and smooth whatever turns c₂ has made.
             one, two, a = two, one, jnp.stack([-a[0], jnp.ones_like(a[0])]) / a[1]
     # Its markers, fields of other joints, are those of its first coordinate.
@@ -182,9 +185,10 @@ def coupling(
 
 
 def _without_zeros(a: Float[Array, " k"]) -> Float[Array, " k"]:
-    while len(a) > 1 and not isinstance(a, Tracer) and a[-1] == 0:
-        a = a[:-1]
-    return a
+    if isinstance(a, Tracer):
+        return a
+    needed = np.flatnonzero(np.asarray(a)).max(initial=0) + 1
+    return a if needed == len(a) else a[:needed]
 
 
 def distance(
@@ -287,6 +291,6 @@ def _in_reference(body: Part, at: Marker) -> Float[Array, " d"]:
 
 def _positive(label: str, what: str, value: Numbers) -> Float[Array, ""]:
     number = numbers(value)
-    if not isinstance(number, Tracer) and not (number.ndim == 0 and number > 0):
+    if not isinstance(number, Tracer) and not (number.ndim == 0 and np.asarray(number) > 0):
         raise ValueError(f"Joint {label!r}: `{what}` must be a positive number, but is {value}.")
     return number

@@ -155,7 +155,7 @@ def spring(
     """
     label, coordinate = _named("spring", on, name), only_coordinate(on)
     law = Spring(_number(label, "stiffness", stiffness), _number(label, "rest", rest), coordinate.is_turn)
-    if law.is_turn and not isinstance(law.rest, Tracer) and abs(law.rest) >= HALF_TURN:
+    if law.is_turn and not isinstance(law.rest, Tracer) and np.abs(law.rest) >= HALF_TURN:
         raise ValueError(
             f"Spring {label!r}: the rest of an angle in space must be less than half a turn from the reference configuration, whose "
             f"turns are not known, but is {float(law.rest):.6g} rad. Take another reference configuration."
@@ -189,7 +189,7 @@ def friction(
     label = _named("friction", on, name)
     given = (("viscous", viscous), ("coulomb", coulomb), ("smoothing", smoothing))
     law = Friction(*(_number(label, what, value) for what, value in given))
-    if not isinstance(law.smoothing, Tracer) and not law.smoothing > 0:
+    if not isinstance(law.smoothing, Tracer) and not np.asarray(law.smoothing) > 0:
         raise ValueError(f"Load {label!r}: `smoothing` must be a positive speed, but is {smoothing}.")
     return Along(label, only_coordinate(on), law)
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._compat import at_ease
 from ..formulations import Baumgarte
 from ..solution import RESULTS, DAESolution
 from ..solve import daesolve
@@ -152,6 +153,7 @@ class BaumgarteLoss:
         return int(np.ceil(float(cast(float, duration)) / h)) + 16
 
 
+@at_ease
 def baumgarte_loss(
     system: ConstrainedSystem,
     y0: State,

@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.special import gammaincc
 from jaxtyping import Array, Bool, Float, PyTree
 
+from .._compat import at_ease
 from ..solution import AccuracyWarning
 from ..types import DType, Scalar
 from ..validate.states import NUMBERS, brief, describe
@@ -30,6 +31,7 @@ AT_THE_START = (
 )
 
 
+@at_ease
 def identify(
     model: Callable[[Any], Any],
     params: PyTree,

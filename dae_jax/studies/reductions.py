@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
+from .._compat import at_ease
 from ..consistent import consistent_state
 from ..diagnostics import drift, energy
 from ..solution import RESULTS, DAESolution
@@ -56,6 +57,7 @@ def first_flip(ts: Float[Array, " times"], arm: Float[Array, "times 2"]) -> Floa
     return first_time(ts, jnp.abs(angle) >= jnp.pi)
 
 
+@at_ease
 def lyapunov(
     system: ConstrainedSystem,
     solver: Solver,

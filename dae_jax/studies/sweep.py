@@ -22,6 +22,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
+from .._compat import at_ease
 from ..compiler import processors
 from ..compiler.jaxprs.walk import equations, jaxprs_in
 from ..driver.failures import sentence_of
@@ -80,6 +81,7 @@ def grid(**axes: ArrayLike | Sequence[float]) -> Grid:
     return Grid(arrays)
 
 
+@at_ease
 def sweep(
     fn: Callable[[Any], State],
     inputs: State | Grid,

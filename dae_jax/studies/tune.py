@@ -10,6 +10,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
+from .._compat import at_ease
 from ..tables import table
 from ..validate.states import NUMBERS, brief, counted
 from .progress import Progress
@@ -84,6 +85,7 @@ class _Point(NamedTuple):
     stale: Any
 
 
+@at_ease
 def tune(
     loss: Callable[[Any], Any],
     params: PyTree,
