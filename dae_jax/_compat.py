@@ -8,8 +8,6 @@ from diffrax._term import WrapTerm as WrapTerm
 from equinox.internal import unvmap_any as unvmap_any, while_loop as while_loop
 from jax._src.core import trace_state_clean as trace_state_clean
 
-from .compiler._compat import at_ease as at_ease
-
 
 # Whose log has the traceback of an error that a callback raised, before JAX raises its own.
 CALLBACK_LOG = "jax._src.callback"

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.sparse import csr_array
 
-from ._compat import at_ease
+from .compiler import at_ease
 from .equations.derivative_orders import Offsets, find_offsets
 from .equations.residual_form import ResidualForm
 from .equations.slopes import Slopes

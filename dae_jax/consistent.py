@@ -9,7 +9,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, PyTree
 
-from ._compat import at_ease
+from .compiler import at_ease
 from .equations.constraint_jacobian import dense_mass, mass_solve
 from .equations.initial_rates import is_nonlinear, rates_of
 from .equations.linearised import LinearisedResidual

@@ -15,7 +15,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from ._compat import at_ease
+from .compiler import at_ease
 from .equations.constraint_jacobian import Rank, dense_mass
 from .equations.mechanical import MechanicalODE
 from .equations.regularity import mass_is_regular, mass_message, rank_message, redundancy

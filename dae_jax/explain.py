@@ -13,8 +13,7 @@ from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array, Float, PyTree
 
-from ._compat import at_ease
-from .compiler import Decision, decision, equations, one_kernel_enabled, without_checks
+from .compiler import Decision, at_ease, decision, equations, one_kernel_enabled, without_checks
 from .driver.program import Solve
 from .driver.start import refuse_bad_start, refuse_no_time
 from .equations.constraint_jacobian import SparseNormals

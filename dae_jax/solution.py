@@ -11,7 +11,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree, Real
 
-from ._compat import at_ease, messages
+from ._compat import messages
+from .compiler import at_ease
 from .tables import table
 from .types import Args, DType, State, Time
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from ._compat import at_ease
+from .compiler import at_ease
 from .compiler.types import Arrays
 from .driver.doubts import warn
 from .driver.event_functions import refuse_other_outputs

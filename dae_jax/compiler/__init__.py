@@ -1,7 +1,7 @@
 """How small functions become fast machine code: scalar arithmetic and single kernels."""
 
 from . import waiting as waiting
-from ._compat import scan_counts as scan_counts
+from ._compat import at_ease as at_ease, scan_counts as scan_counts
 from .fallbacks import left_to_xla as left_to_xla
 from .jaxprs.gathers import gathered as gathered, windows as windows
 from .jaxprs.numbers import on_numbers as on_numbers

@@ -166,8 +166,9 @@ def coupling(
     the coupling is linear and either c₁ is none, or a₁ or 1/a₁ is a whole number.
     """
     one, two = only_coordinate(first), None if second is None else only_coordinate(second)
-    label, a = f"coupling of {one.name}" if name is None else name, jnp.atleast_1d(numbers(coefficients))
-    a = _without_zeros(a)
+    label, a = f"coupling of {one.name}" if name is None else name, numbers(coefficients)
+    # Of what is known, `atleast_1d` is known no more in `jit`.
+    a = _without_zeros(a if a.ndim else a[None])
     if two is not None and two.is_turn and len(a) > 1:
         ratio = None if isinstance(a, Tracer) else float(np.asarray(a)[1])
         whole = lambda x: abs(x - round(x)) < WHOLE

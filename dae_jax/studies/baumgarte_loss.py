@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._compat import at_ease
+from ..compiler import at_ease
 from ..formulations import Baumgarte
 from ..solution import RESULTS, DAESolution
 from ..solve import daesolve

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.special import gammaincc
 from jaxtyping import Array, Bool, Float, PyTree
 
-from .._compat import at_ease
+from ..compiler import at_ease
 from ..solution import AccuracyWarning
 from ..types import DType, Scalar
 from ..validate.states import NUMBERS, brief, describe

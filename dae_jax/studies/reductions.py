@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from .._compat import at_ease
+from ..compiler import at_ease
 from ..consistent import consistent_state
 from ..diagnostics import drift, energy
 from ..solution import RESULTS, DAESolution

@@ -22,8 +22,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
-from .._compat import at_ease
-from ..compiler import processors
+from ..compiler import at_ease, processors
 from ..compiler.jaxprs.walk import equations, jaxprs_in
 from ..driver.failures import sentence_of
 from ..solution import RESULTS

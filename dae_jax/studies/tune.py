@@ -10,7 +10,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from .._compat import at_ease
+from ..compiler import at_ease
 from ..tables import table
 from ..validate.states import NUMBERS, brief, counted
 from .progress import Progress
