@@ -228,7 +228,7 @@ def reference_row(body: Body | Ground, dimension: int) -> Float[Array, " k"]:
 
 
 def reference_pose(body: Body | Ground, dimension: int) -> Pose:
-    """Where it is there."""
+    """Where a body is in the reference configuration."""
     return pose(reference_row(body, dimension))
 
 

@@ -168,12 +168,12 @@ def value(
 
 
 def is_within_half_a_turn(
-    q_a: Float[Array, " k"], q_b: Float[Array, " k"], on_a: MarkerArrays, on_b: MarkerArrays
+    q_a: Float[Array, " k"], q_b: Float[Array, " k"], reference_a: Float[Array, "4"], reference_b: Float[Array, "4"]
 ) -> Bool[Array, ""]:
-    """Whether b has turned in space by less than half a turn against a, about the z axis of a's frame, since the reference
-    configuration. Beyond it is false for another full turn: quaternions on the way do not jump.
+    """Whether b has turned in space by less than half a turn against a since the reference configuration, where their quaternions
+    were these. Beyond it is false for another full turn: quaternions on the way do not jump.
     """
-    turned_a, turned_b = (product(q[3:], conjugate(on[2])) for q, on in ((q_a, on_a), (q_b, on_b)))
+    turned_a, turned_b = product(q_a[3:], conjugate(reference_a)), product(q_b[3:], conjugate(reference_b))
     return product(conjugate(turned_a), turned_b)[0] > 0
 
 

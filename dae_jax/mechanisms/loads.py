@@ -94,9 +94,9 @@ def along(loads: Sequence[Along], t: Time, at: Configuration, args: Args) -> Flo
 
     u, q = at.velocities, at.rows
     c, rate, slopes = jax.vmap(one)((q[a], q[b]), (u[a], u[b]), (on_a, on_b))
-    if any(load.counts_turns for load in loads):
-        counts = np.array([load.counts_turns for load in loads])
-        c = jnp.where(jax.vmap(is_within_half_a_turn)(q[a], q[b], on_a, on_b) | ~counts, c, jnp.nan)
+    counts = np.array([load.counts_turns for load in loads])
+    if counts.any():
+        c = jnp.where(jax.vmap(is_within_half_a_turn)(q[a], q[b], on_a[2], on_b[2]) | ~counts, c, jnp.nan)
     efforts = jnp.stack([load.law.effort(t, c[k], rate[k], args) for k, load in enumerate(loads)])
     total = jnp.zeros_like(at.q.values)
     for rows, slope in zip((a, b), slopes, strict=True):
