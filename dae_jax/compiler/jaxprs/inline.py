@@ -10,6 +10,7 @@ from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Primitive, Var, jaxp
 from jaxtyping import Array
 
 from ..types import Atom, Aval, Equation, Params, aval_of
+from .few_turns import written_out
 from .special_functions import SPECIAL, by_simpler_ones
 from .walk import called, identity, of_solve
 
@@ -52,6 +53,7 @@ class _Flat:
         self.eqns: list[JaxprEqn] = []
         self.constants: dict[int, tuple[Var, Any]] = {}
         self._known: dict[Hashable, list[Any]] = {}
+        self._made: dict[Any, JaxprEqn] = {}
 
     def run(self, closed: ClosedJaxpr, args: Sequence[Atom]) -> list[Any]:
         """Writes down the equations of a jaxpr; gives the variables of its results."""
@@ -81,6 +83,8 @@ class _Flat:
             return args[:1] if scalar else self.run(_meaning(eqn), args)
         if name == "while" and eqn.params["cond_jaxpr"].out_avals[0].shape:
             eqn, args = _until_all_are_done(eqn, args)
+        if name == "while" and (turns := written_out(eqn, args, self._made.get, inlined)) is not None:
+            return self.run(turns, args)
         if name in _SAME_IF_SO_SHAPED and _like(aval_of(args[0]), aval_of(eqn.outvars[0])):
             return args[:1]
         atoms = [_atom(x) for x in args]
@@ -89,6 +93,7 @@ class _Flat:
         if found is None:
             found = self._known[key] = [Var(v.aval) for v in eqn.outvars]
             self.eqns.append(eqn.replace(invars=args, outvars=found))
+            self._made.update(dict.fromkeys(found, self.eqns[-1]))
         return found
 
 
