@@ -32,7 +32,7 @@ class StateSpace(AbstractFieldFormulation):
 
     - `chart`: ψ, as `chart(z)` or `chart(t, z, args)`, from a vector of n − m numbers to q in the structure of q. It
       must satisfy the constraints for every z. Its inverse at the start is found by Newton's method, from several
-      guesses.
+      guesses; of several z that are the start, the one with the smallest entries is taken.
     - `guess`: z near the start, where the chart folds and the default guesses end on a wrong sheet.
 
     Errors: a chart of the wrong dimension or one that does not reach the initial state is refused.
@@ -126,7 +126,7 @@ class ChartODE(eqx.Module):
         return self.mechanical.decode(t, (self.position(t, z), self.velocity(t, z, w)))
 
     def encode(self, t: Time, y: Phase, guess: State) -> Any:
-        """(z, ż) of a flat (q, v), by Newton's method on Jᵀ(ψ(z) − q) = 0 from the best of several guesses."""
+        """(z, ż) of a flat (q, v), by Newton's method on Jᵀ(ψ(z) − q) = 0 from several guesses."""
         q, v = y
         guesses = _guesses(self.dimension, q.dtype) if guess is None else jnp.atleast_2d(jnp.asarray(guess, q.dtype))
         if guesses.shape[1] != self.dimension:
@@ -145,11 +145,11 @@ class ChartODE(eqx.Module):
             return z, jnp.where(jnp.isfinite(distance), distance, jnp.inf)
 
         zs, distances = jax.vmap(refine)(jax.lax.stop_gradient(guesses))
-        nearest = jnp.argmin(distances)
-        params = (self, t, q)
-        z, _ = newton(_normal_equations, jax.lax.stop_gradient(zs[nearest]), params)
-        reached = jnp.sqrt(distances[nearest]) <= jnp.finfo(q.dtype).eps ** 0.5 * (1 + jnp.max(jnp.abs(q)))
-        z = jnp.where(reached, z, jnp.nan)
+        reached = jnp.sqrt(distances) <= jnp.finfo(q.dtype).eps ** 0.5 * (1 + jnp.max(jnp.abs(q)))
+        # Of the points that are q, such as an angle and whole turns more, that nearest 0: the distances of all are rounding.
+        best = jnp.argmin(jnp.where(reached, jnp.max(jnp.abs(zs), 1), jnp.inf))
+        z, _ = newton(_normal_equations, jax.lax.stop_gradient(zs[best]), (self, t, q))
+        z = jnp.where(reached[best], z, jnp.nan)
         return z, _least_squares(self, t, z, v - self.velocity(t, z, jnp.zeros_like(z)))
 
 

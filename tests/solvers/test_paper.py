@@ -3,6 +3,7 @@
 import dataclasses
 
 import diffrax
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -154,3 +155,14 @@ def test_the_pendulums_reference_satisfies_its_equation(rate):
     acceleration = np.sum((after - before) / (2 * h) * tangent, 1)
     np.testing.assert_allclose(acceleration, 9.81 * tangent[:, 1], atol=1e-5)
     np.testing.assert_allclose([scene.reference(np.zeros(1))[i][0] for i in (0, 1)], scene.y0, atol=1e-12)
+
+
+@pytest.mark.parametrize("rounding", [0.0, 1e-16, -2e-16])
+def test_the_coordinates_of_a_chart_are_the_smallest_ones(rounding):
+    """Whole turns more are the same start, at a tolerance that grows with them: rounding must not choose between them."""
+    angles = np.linspace(-3.0, 3.0, 61) * (1 + rounding)
+    scene = dae_jax.scenes.pendulum()
+    chart = dae_jax.StateSpace(lambda z: jnp.stack([jnp.sin(z[0]), jnp.cos(z[0])]))
+    start = lambda a: (jnp.stack([jnp.sin(a), jnp.cos(a)]), jnp.zeros(2))
+    found = jax.vmap(lambda a: chart.encode(scene.system, 0.0, start(a), scene.args)[0][0][0])(angles)
+    np.testing.assert_allclose(found, angles, atol=1e-12)

@@ -10,6 +10,7 @@ from ..jaxprs.numbers import converted
 from ..jaxprs.objects import is_number
 from . import complex_arithmetic
 from .dtypes import BYTES, is_signed, kind_of, part
+from .extrema import absolute, extremum
 from .instructions import Complex, Instructions, Number, Value, parts
 
 
@@ -43,15 +44,6 @@ def applied(code: Instructions, name: str, dtype: np.dtype, a: Number, b: Number
     return code.op(name, kind, a, b)
 
 
-def extremum(code: Instructions, name: str, kind: str, a: Number, b: Number) -> Any:
-    """`maximum` or `minimum` of two floats: NaN where one is, and 0 above −0."""
-    if kind == "float" or code.target is None or not code.target.is_gpu:
-        return code.intrinsic(name, kind, a, b)
-    # Of doubles a GPU has these but for NaN only; LLVM makes ten instructions of what these three are.
-    found = code.intrinsic(name.replace("imum", "num"), kind, a, b)
-    return code.select(code.op("fcmp uno", kind, a, b, result="i1"), np.nan, found, kind)
-
-
 def combined(code: Instructions, name: str, dtype: np.dtype, a: Number, b: Number) -> Any:
     """The same of numbers that may be known both, by `logaddexp` too; `div` and `rem` are not."""
     if is_number(a) and is_number(b):
@@ -78,7 +70,7 @@ def _of_floats(code: Instructions, name: str, kind: str, a: Number, b: Number) -
 def _log_of_sum(code: Instructions, kind: str, a: Number, b: Number) -> Value:
     """log(eᵃ + eᵇ)."""
     largest = extremum(code, "maximum", kind, a, b)
-    apart = code.intrinsic("fabs", kind, code.op("fsub", kind, a, b))
+    apart = absolute(code, kind, code.op("fsub", kind, a, b))
     more = code.library("log1p", kind, code.library("exp", kind, code.op("fneg", kind, apart)))
     # Of two infinities of one sign the difference is none.
     undefined = code.op("fcmp uno", kind, apart, apart, result="i1")

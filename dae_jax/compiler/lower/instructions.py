@@ -55,6 +55,8 @@ class Instructions:
         # What has been written, by its text: in the function, and in each scope that is open.
         self._known: list[dict[str, Value]] = [{}]
         self._scaled: dict[str, tuple[Value, float]] = {}
+        # The names of floats whose sign bit is 0, also if they are NaN.
+        self.without_sign: set[str] = set()
 
     # Text
 

@@ -3,7 +3,7 @@
 from typing import Any
 
 from ...types import Equation
-from .. import complex_arithmetic
+from .. import complex_arithmetic, extrema
 from ..arithmetic import applied, compared, convert, power, total
 from ..context import Context
 from ..dtypes import ALL, BOOL, COMPLEX, FLOATS, INTEGERS, NUMBERS, REALS, is_signed, kind_of, part
@@ -72,7 +72,7 @@ def absolute(context: Context, x: Number, **_: object) -> Any:
     if dtype.kind == "c":
         return complex_arithmetic.size(code, kind, x)
     if dtype.kind == "f":
-        return code.intrinsic("fabs", kind, x)
+        return extrema.absolute(code, kind, x)
     return code.intrinsic("smax", kind, x, code.op("sub", kind, 0, x)) if is_signed(dtype) else x
 
 
