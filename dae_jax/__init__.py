@@ -58,9 +58,10 @@ from .solvers import (
     Trapezoid as Trapezoid,
 )
 from .studies.baumgarte_loss import BaumgarteLoss as BaumgarteLoss, baumgarte_loss as baumgarte_loss
+from .studies.grid import Grid as Grid, grid as grid
 from .studies.identified import Identified as Identified
 from .studies.identify import identify as identify
-from .studies.sweep import Grid as Grid, grid as grid, sweep as sweep
+from .studies.sweep import sweep as sweep
 from .studies.tune import Tuned as Tuned, tune as tune
 from .systems import (
     ConstrainedSystem as ConstrainedSystem,

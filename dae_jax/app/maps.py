@@ -15,8 +15,9 @@ from ..solution import RESULTS
 from ..solve import daesolve
 from ..solvers import DOP853, OrthogonalProjection
 from ..studies.baumgarte_loss import FAILED, BaumgarteLoss, Verification, baumgarte_loss
+from ..studies.grid import grid
 from ..studies.reductions import first_flip, lyapunov
-from ..studies.sweep import grid, sweep
+from ..studies.sweep import sweep
 from ..studies.tune import descent
 from ..systems import ConstrainedSystem
 from . import plotting

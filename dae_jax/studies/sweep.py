@@ -1,6 +1,5 @@
 """`sweep`: a function of one element over many, in chunks, on all cores and devices, resumable."""
 
-import dataclasses
 import functools
 import hashlib
 import os
@@ -19,7 +18,6 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.extend.core import ClosedJaxpr
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from ..compiler import at_ease, processors
@@ -30,6 +28,7 @@ from ..types import State
 from ..validate.captured import current
 from ..validate.states import brief
 from ..validate.user_functions import TRACED
+from .grid import Grid
 from .progress import Progress
 from .sweep_store import Memory, Store
 
@@ -38,6 +37,8 @@ from .sweep_store import Memory, Store
 # its start; on a GPU each is a thread, of which 100,000 and more run at a time; elsewhere they run in step.
 LANES = {"cpu": 512, "gpu": 2**17}
 LANES_OF_ACCELERATOR = 8192
+# What goes in and comes out takes this part of a device's memory at most: several chunks are on their way at once.
+PART_OF_MEMORY = 16
 
 
 class Device(Protocol):
@@ -46,38 +47,7 @@ class Device(Protocol):
     @property
     def platform(self) -> str: ...
 
-
-@dataclasses.dataclass(frozen=True)
-class Grid:
-    """All combinations of the values of named axes; see `grid`."""
-
-    axes: dict[str, np.ndarray]
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """The number of values of each axis."""
-        return tuple(len(x) for x in self.axes.values())
-
-    def elements(self) -> dict[str, np.ndarray]:
-        """The combinations, the last axis fastest: one array for each name, with one leading axis."""
-        return {
-            name: x.ravel() for name, x in zip(self.axes, np.meshgrid(*self.axes.values(), indexing="ij"), strict=True)
-        }
-
-
-def grid(**axes: ArrayLike | Sequence[float]) -> Grid:
-    """A grid for `sweep`: `grid(alpha=..., beta=...)`. The function gets {"alpha": α, "beta": β}, the results have a
-    leading axis for each name, in this order.
-
-    Errors: `ValueError` for an axis that is not one-dimensional or is empty.
-    """
-    if not axes:
-        raise ValueError("`grid` needs at least one axis, such as alpha=jnp.logspace(-1, 4, 100).")
-    arrays = {name: np.asarray(x) for name, x in axes.items()}
-    for name, x in arrays.items():
-        if x.ndim != 1 or not x.size:
-            raise ValueError(f"`{name}` must be a sequence of numbers, but has the shape {x.shape}.")
-    return Grid(arrays)
+    def memory_stats(self) -> Any: ...
 
 
 @at_ease
@@ -97,7 +67,8 @@ def sweep(
     - `fn`: any JAX function of one element to a pytree of arrays, usually a `daesolve(..., throw=False)` and what is to
       be kept of it: a final state, a maximum of the drift, an energy error. What it returns is all that is kept.
     - `inputs`: a pytree of arrays with a common leading axis, or a `grid`.
-    - `chunk_size`: elements of one compiled call; by default 128 for each CPU device, 8192 for each accelerator.
+    - `chunk_size`: elements of one compiled call; by default 512 for each CPU device, on each GPU 131,072, or as many as a
+      sixteenth of its memory holds the inputs and results of, and 8192 for each other accelerator.
     - `devices`: by default all of this process. On one CPU device several chunks run at once, one for each core.
     - `progress`: a bar on stderr, with the rate, the time left, and how many solves failed; at the end, why.
     - `store`: a folder. Results are written there as they come; the same sweep with the same folder goes on where it was
@@ -119,14 +90,11 @@ def sweep(
     elements = inputs.elements() if isinstance(inputs, Grid) else jax.tree.map(np.asarray, inputs)
     size = _leading(elements)
     devices = list(devices or jax.local_devices())
-    lanes = (
-        LANES.get(devices[0].platform, LANES_OF_ACCELERATOR) if chunk_size is None else -(-chunk_size // len(devices))
-    )
-    if lanes < 1:
+    if chunk_size is not None and chunk_size < 1:
         raise ValueError(f"`chunk_size` must be at least 1, but is {chunk_size}.")
-    lanes = min(lanes, -(-size // len(devices)))
-    chunk = lanes * len(devices)
     try:
+        lanes = _lanes(fn, elements, devices[0]) if chunk_size is None else -(-chunk_size // len(devices))
+        chunk = min(lanes, -(-size // len(devices))) * len(devices)
         call, out = _compiled(fn, elements, chunk, devices)
     except TRACED as error:
         raise ValueError(
@@ -151,6 +119,24 @@ def sweep(
     if isinstance(inputs, Grid):
         arrays = [x.reshape(*inputs.shape, *x.shape[1:]) for x in arrays]
     return jax.tree.unflatten(structure, arrays)
+
+
+def _lanes(fn: Callable[..., PyTree], elements: PyTree, device: Device) -> int:
+    """How many elements a device gets at a time."""
+    most = LANES.get(device.platform, LANES_OF_ACCELERATOR)
+    memory = (device.memory_stats() or {}).get("bytes_limit")
+    if memory is None:
+        return most
+    one = _one(elements)
+    bytes_of = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves((one, jax.eval_shape(fn, one))))
+    held = memory // PART_OF_MEMORY // max(bytes_of, 1)
+    # A power of two: what was stored goes on where a little more or less memory is free.
+    return min(most, 2 ** max(held.bit_length() - 1, 0))
+
+
+def _one(elements: PyTree) -> PyTree:
+    """The shapes of one element."""
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], jax.dtypes.canonicalize_dtype(x.dtype)), elements)
 
 
 def _leading(elements: PyTree) -> int:
@@ -274,8 +260,7 @@ def _gathered(x: np.ndarray) -> np.ndarray:
 
 def _fingerprint(fn: Callable[..., PyTree], elements: PyTree, chunk: int) -> str:
     """What makes two sweeps the same: the function as it is traced, its constants at any depth, the elements, and the chunks."""
-    one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], jax.dtypes.canonicalize_dtype(x.dtype)), elements)
-    closed = jax.make_jaxpr(fn)(one)
+    closed = jax.make_jaxpr(fn)(_one(elements))
     found = hashlib.sha256(re.sub(r"0x[0-9a-f]+", "", str(closed)).encode())
     inner = (jaxpr for eqn in equations(closed) for jaxpr in jaxprs_in(tuple(eqn.params.values())))
     constants = (x for jaxpr in (closed, *inner) if isinstance(jaxpr, ClosedJaxpr) for x in jaxpr.consts)

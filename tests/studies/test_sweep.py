@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import time
+import types
 
 import diffrax
 import jax
@@ -17,6 +18,7 @@ import pytest
 import dae_jax
 from dae_jax import reductions
 from dae_jax.scenes import SCENES
+from dae_jax.studies import sweep as sweep_file
 
 
 PENDULUM = SCENES["pendulum"]()
@@ -290,3 +292,14 @@ class TestOfASolveThatEndsEarly:
 def test_what_is_not_traceable_is_refused_in_a_sentence():
     with pytest.raises(ValueError, match="`fn` must be traceable by JAX, but makes numbers of what it is given"):
         dae_jax.sweep(lambda angle: float(angle), np.linspace(0, 1, 3), progress=False)
+
+
+@pytest.mark.parametrize(("gigabytes", "lanes"), [(80, 2**17), (1, 2**13), (1e-6, 1)])
+def test_a_chunk_fits_the_memory_of_a_gpu(gigabytes, lanes):
+    """1,000 numbers of 8 bytes an element, of which a sixteenth of the memory holds so many."""
+    gpu = types.SimpleNamespace(platform="gpu", memory_stats=lambda: {"bytes_limit": int(gigabytes * 2**30)})
+    assert sweep_file._lanes(lambda x: jnp.full(1000, x), np.ones(5), gpu) == lanes
+
+
+def test_a_chunk_of_a_cpu_is_a_number_of_vectors():
+    assert sweep_file._lanes(lambda x: 1 / 0, np.ones(5), jax.devices("cpu")[0]) == 512
