@@ -38,6 +38,8 @@ class Thresholds:
     Size:
     - `instructions`: more take longer to compile than they save. A four-bar linkage by dummy derivatives (75,000) is ready in 8 s and
       takes 7.3 ms, by XLA's single kernel in 15 s and takes 20.
+    - `ptx_lines`: lines of PTX above which NVIDIA's compiler optimises less: the gradient of a chain of 12 links (26,000) takes it
+      5 s in place of 24, with a third less that does not fit into registers; of 8 links (25,000) 5 in place of 8.
     - `overestimate`: the estimate counts up to this many instructions for each that is written, since it knows of no zeros and of
       nothing that is there twice. In between the function is written to see.
     - `whole`, `procedure`: in a program of more than `whole` instructions a function that is called at several places is a
@@ -63,6 +65,7 @@ class Thresholds:
     largest_matrix: int = 32
     longest_sort: int = 256
     instructions: int = 200_000
+    ptx_lines: int = 20_000
     overestimate: int = 4
     whole: int = 200_000
     procedure: int = 500

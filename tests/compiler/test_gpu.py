@@ -20,6 +20,7 @@ from dae_jax.compiler import kernel_call, lower, on_gpu
 from dae_jax.compiler.emit import cuda_driver, interface, launch, ptx, register, target
 from dae_jax.compiler.jaxprs.scalar_interpreter import Unsupported
 from dae_jax.compiler.lower import arithmetic, extrema
+from dae_jax.compiler.thresholds import THRESHOLDS
 from dae_jax.scenes import pendulum
 from tests.compiler.fuzz import campaign, check
 from tests.methods import METHODS
@@ -319,6 +320,10 @@ class TestLaunch:
     )
     def test_grids(self, elements, threads, grid):
         assert cuda_driver.Function(1, 4, 4096, 2**30).grid(elements, threads) == grid
+
+    def test_long_kernels_are_optimised_less(self):
+        assert cuda_driver.effort("\n" * THRESHOLDS.ptx_lines) == 4
+        assert cuda_driver.effort("\n" * (THRESHOLDS.ptx_lines + 1)) == 1
 
     def test_room_is_a_part_of_the_memory(self):
         function = cuda_driver.Function(1, 4, 4096, 2**30)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ..jaxprs.scalar_interpreter import Unsupported
+from ..thresholds import THRESHOLDS
 
 
 # cuda.h
@@ -61,12 +62,12 @@ class Driver:
         self._call("cuDevicePrimaryCtxRetain", ctypes.byref(context), handle)
         self._call("cuCtxPushCurrent_v2", context)
         try:
-            # 5, 6: where the compiler writes what is wrong, and how long that may be.
+            # 5, 6: where the compiler writes what is wrong, and how long that may be; 7: how much it optimises.
             said = ctypes.create_string_buffer(4096)
-            options = (ctypes.c_int * 2)(5, 6)
-            values = (ctypes.c_void_p * 2)(ctypes.addressof(said), len(said))
+            options = (ctypes.c_int * 3)(5, 6, 7)
+            values = (ctypes.c_void_p * 3)(ctypes.addressof(said), len(said), effort(code))
             try:
-                self._call("cuModuleLoadDataEx", ctypes.byref(module), code.encode(), 2, options, values)
+                self._call("cuModuleLoadDataEx", ctypes.byref(module), code.encode(), len(options), options, values)
             except RuntimeError as error:
                 raise Unsupported(f"{error}: {said.value.decode(errors='replace')[:500]}") from error
             self._call("cuModuleGetFunction", ctypes.byref(function), module, name.encode())
@@ -99,6 +100,11 @@ class Driver:
             parameters,
             None,
         )
+
+
+def effort(code: str) -> int:
+    """How much the driver's compiler optimises a kernel, of 4 at most."""
+    return 1 if code.count("\n") > THRESHOLDS.ptx_lines else 4
 
 
 @functools.cache
