@@ -24,7 +24,7 @@ from .tables import table
 from .types import Args, Flat, State, Time
 from .validate.captured import current
 from .validate.states import counted, refuse_wrong_state
-from .validate.user_functions import refuse_wrong_functions
+from .validate.user_functions import at_numbers, refuse_wrong_functions
 
 
 # A system of more variables is summed up in words; its incidence matrix would not fit a page.
@@ -212,6 +212,7 @@ class Structure:
 
 
 @at_ease
+@at_numbers
 def analyse(system: System, t0: Time, y0: State, args: Args = None) -> Structure:
     """The structure of a system: index, offsets, degrees of freedom, hidden constraints.
 
@@ -219,7 +220,7 @@ def analyse(system: System, t0: Time, y0: State, args: Args = None) -> Structure
     variable is read from the jaxpr, for any t; `y0` gives shapes, and the place where the Jacobian is looked at.
 
     Errors: `ValueError` for a structurally singular system, naming the equations that have too few variables and the
-    variables that have too few equations.
+    variables that have too few equations, and within `jit`, `vmap` and `grad` of what is looked at.
     """
     refuse_wrong_state(system, y0)
     system, args = current((system, args))

@@ -31,6 +31,7 @@ from .systems import ConstrainedSystem, System, is_mechanism
 from .tables import table
 from .types import Args, Controller, Flat, ProgressMeter, Solver, State, Time
 from .validate.states import counted
+from .validate.user_functions import at_numbers
 
 
 _COMPILERS = {"llvm": "yes, by our compiler (LLVM)", "xla kernel": "yes, by XLA", "xla": "no, XLA as it is"}
@@ -180,6 +181,7 @@ class ResidualPlan(Plan):
 
 
 @at_ease
+@at_numbers
 def explain(
     system: System,
     solver: Solver,

@@ -1,9 +1,10 @@
 """What the user's functions take and return, looked at without numbers: wrong ones are refused in a sentence."""
 
+import functools
 import inspect
 import types
 from collections.abc import Callable, Hashable
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import equinox as eqx
 import jax
@@ -30,6 +31,24 @@ LEADING_AXIS = (
     "`y0` must be one state, but has a leading axis of length {}: a time axis as in `sol.ys`, or a batch. Go on from the last "
     "saved state with `y0=sol.final`, that is `jax.tree.map(lambda x: x[-1], sol.ys)`; solve a batch with `jax.vmap`."
 )
+
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def at_numbers(fn: F) -> F:
+    """A function that looks at the numbers it is given, or that the user's functions close over; what traces them is refused."""
+
+    @functools.wraps(fn)
+    def checked(*args: Any, **options: Any) -> Any:
+        try:
+            return fn(*args, **options)
+        except TRACED as error:
+            raise ValueError(
+                f"`{fn.__name__}` looks at numbers, which are not known within `jit`, `vmap` and `grad`: call it outside of them."
+            ) from error
+
+    return cast("F", checked)
 
 
 # The last functions that have been seen to have the same numbers in them each time they are called, by their keys.

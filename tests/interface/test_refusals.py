@@ -245,6 +245,8 @@ AROUND = {
     "consistent_state fixed in another shape": (lambda: D.consistent_state(PENDULUM, 0.0, (Q0, V0), fixed=(np.ones(3, bool), False)), "(float64[2], float64[2]), but is (bool[3], bool[])."),
     "analyse of a vector": (lambda: D.analyse(PENDULUM, 0.0, jnp.ones(4)), "`y0` must be the pair (q, v)"),
     "analyse of a function": (lambda: D.analyse(force, 0.0, jnp.ones(4)), "ImplicitDAE, but is a function."),
+    "analyse within jit": (lambda: jax.jit(lambda a: D.analyse(PENDULUM, 0.0, (a * Q0, V0)).index + a)(1.0), "`analyse` looks at numbers, which are not known within `jit`"),
+    "explain within vmap": (lambda: jax.vmap(lambda a: D.explain(D.SemiExplicitDAE(lambda t, x, z, _: z * a, lambda t, x, z, _: x - z * a), D.BDF(), 0.0, (Q0, V0)).index + a)(Q0), "`explain` looks at numbers, which are not known within `jit`"),
     "explain in another order": (lambda: D.explain(PENDULUM, PROJECTED, (Q0, V0), 0.0), "`t0` must be a real number"),
     "explain of a wrong force": (lambda: D.explain(D.ConstrainedSystem(lambda t, q, v, a: None, constraint), PROJECTED, 0.0, (Q0, V0)), "`force(t, q, v, args)` must return real numbers"),
     "sweep of nothing": (lambda: D.sweep(None, jnp.ones(3)), "`fn` must be a function of one element, but is None."),

@@ -59,6 +59,12 @@ def _in_while(fn: Any, k: Any, xs: Any) -> Any:
     return lax.while_loop(lambda c: c[0] < k % 3 + 1, turn, (jnp.int32(0), tuple(xs), fn(*xs)))[2]
 
 
+def _in_few_turns(fn: Any, k: Any, xs: Any) -> Any:
+    turn = lambda c: (c[0] + 1, tuple(map(_turned, c[1])), fn(*c[1]))
+    first = jnp.where(k % 2 == 0, 0, 1)
+    return lax.while_loop(lambda c: c[0] < 3, turn, (first, tuple(xs), fn(*xs)))[2]
+
+
 def _in_cond(fn: Any, k: Any, xs: Any) -> Any:
     return lax.cond(k % 2 == 0, fn, lambda *xs: fn(*map(_turned, xs)), *xs)
 
@@ -82,7 +88,10 @@ def called_twice(program: "Program") -> "Program":
     return dataclasses.replace(program, name=f"{program.name} twice", fn=fn)
 
 
-NESTS = {"scan": _in_scan, "while": _in_while, "cond": _in_cond, "switch": _in_switch, "vmap": _in_vmap}
+NESTS = {
+    "scan": _in_scan, "while": _in_while, "few turns": _in_few_turns, "cond": _in_cond, "switch": _in_switch,
+    "vmap": _in_vmap,
+}  # fmt: skip
 
 
 def _pushed(fn: Any, xs: Any) -> Any:
