@@ -29,8 +29,9 @@ from ..solvers import (
 from ..types import Time, Y
 from .bracket import bracketing
 from .crossings import OneCrossing, OnStates
-from .followed_steps import at_steps, taken
-from .passages import passages, watched
+from .followed_steps import RecordedEnds, at_steps, taken
+from .observed_steps import Observer, observed
+from .passages import passages
 from .problem import Problem
 from .start import is_saved_part
 from .summed_errors import SummedErrors
@@ -100,14 +101,15 @@ def call(solve: "Solve", problem: Problem, steps: Float[Array, " steps"] | None 
         event = dataclasses.replace(event, cond_fn=conditions, root_finder=bracketing(event.root_finder))
     saveat = dataclasses.replace(saveat, solver_state=True) if counts(solver) else saveat
     sums_errors = isinstance(controller, diffrax.ConstantStepSize) and not solve.recording
-    controller = SummedErrors(controller) if sums_errors else controller
-    records = steps is None and solve.records_steps()
-    if steps is not None or records:
-        controller = at_steps(controller, steps, solve.max_steps)
+    observers: dict[str, Observer] = {"errors": SummedErrors()} if sums_errors else {}
+    if steps is None and solve.records_steps():
+        assert solve.max_steps is not None
+        observers["ends"] = RecordedEnds(solve.max_steps)
     passage = passages(problem, ode, solve.formulation.decode, not solve.keeps()[0], solve.formulation.inverts_mass)
-    controller = controller if passage is None else watched(controller, passage)
-    if sums_errors or records or passage is not None:
-        saveat = dataclasses.replace(saveat, controller_state=True)
+    if passage is not None:
+        observers["passage"] = passage
+    controller = observed(controller if steps is None else at_steps(controller, steps), observers)
+    saveat = dataclasses.replace(saveat, controller_state=True) if observers else saveat
     sol = diffrax.diffeqsolve(
         solve.formulation.term(),
         _for_loops(solve, solver, y, _real(event, t0, y, ode), t0, t1),
@@ -125,13 +127,11 @@ def call(solve: "Solve", problem: Problem, steps: Float[Array, " steps"] | None 
     starts = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(y)]))
     result = RESULTS.where(starts, RESULTS.promote(sol.result), RESULTS.no_finite_start)
     stats.update((path.split(".")[-1], operator.attrgetter(path)(sol.solver_state)) for path in counts(solver))
-    state = lax.stop_gradient(cast(Any, sol.controller_state))
-    passed = False
-    if passage is not None:
-        state, (passed, determined, _) = state
-        result = RESULTS.where((result == RESULTS.successful) & ~jnp.asarray(determined), RESULTS.undetermined, result)
-    seen = state[-1] if sums_errors else None, passed
-    times = taken(state) if records else steps
+    found = lax.stop_gradient(cast(Any, sol.controller_state)).seen if observers else {}
+    passed, determined, _ = found.get("passage", (False, True, None))
+    result = RESULTS.where((result == RESULTS.successful) & ~jnp.asarray(determined), RESULTS.undetermined, result)
+    seen = found["errors"].total if sums_errors else None, passed
+    times = taken(found["ends"]) if "ends" in found else steps
     return sol.t0, sol.t1, ts["user"], ys["user"], interpolation, stats, result, sol.event_mask, seen, end, times
 
 

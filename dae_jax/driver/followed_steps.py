@@ -13,86 +13,49 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from ..types import IntScalar, Scalar
+from ..equations.manifold_ode import Equations
+from ..types import IntScalar, Scalar, Y
+from .observed_steps import AbstractStepsOf, Step
 
 
-class AbstractStepsOf(diffrax.AbstractAdaptiveStepSizeController):
-    """The steps of another controller with tolerances."""
+class Ends(NamedTuple):
+    """How many steps were accepted, and the times at their ends, that of the start first; then infinity."""
 
-    steps: eqx.AbstractVar[Any]
-
-    @property
-    def rtol(self) -> Any:
-        return self.steps.rtol
-
-    @property
-    def atol(self) -> Any:
-        return self.steps.atol
-
-    @property
-    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return self.steps.norm
-
-
-class Record(NamedTuple):
-    """The controller's state, how many steps were accepted, and the times at their ends, that of the start first; then infinity."""
-
-    steps: Any
     count: IntScalar
     times: Float[Array, " steps"]
 
 
-class RecordedSteps(AbstractStepsOf):
-    """The steps of another controller, written down; `most` of them."""
+class RecordedEnds(eqx.Module):
+    """The ends of steps, written down; `most` of them."""
 
-    steps: Any
     most: int = eqx.field(static=True)
 
-    def wrap(self, direction: Any) -> "RecordedSteps":
-        return type(self)(self.steps.wrap(direction), self.most)  # pyright: ignore[reportCallIssue]
+    def begin(self, t0: Any, y0: Y, args: Equations) -> Ends:
+        """Before the first step."""
+        return Ends(jnp.asarray(0), jnp.full(self.most + 1, jnp.inf, t0.dtype).at[0].set(t0))
 
-    def init(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, error_order: Any
-    ) -> tuple[Any, Record]:
-        first, state = self.steps.init(terms, t0, t1, y0, dt0, args, func, error_order)
-        return first, Record(state, jnp.asarray(0), jnp.full(self.most + 1, jnp.inf, t0.dtype).at[0].set(t0))
-
-    def adapt_step_size(
-        self,
-        t0: Any,
-        t1: Any,
-        y0: Any,
-        y1_candidate: Any,
-        args: Any,
-        y_error: Any,
-        error_order: Any,
-        controller_state: Record,
-    ) -> Any:
-        state, count, times = controller_state
-        keep, *rest, state, result = self.steps.adapt_step_size(
-            t0, t1, y0, y1_candidate, args, y_error, error_order, state
-        )
+    def __call__(self, step: Step, before: Ends) -> Ends:
         # In place: what is rejected is written over, or taken back at the end.
-        times = lax.dynamic_update_index_in_dim(times, lax.stop_gradient(t1), count + 1, 0)
-        return keep, *rest, Record(state, count + keep, times), result
+        end = lax.stop_gradient(step.t1)
+        times = lax.dynamic_update_index_in_dim(before.times, end, before.count + 1, 0)
+        return Ends(before.count + step.kept, times)
 
 
-def at_steps(controller: Any, times: Float[Array, " steps"] | None, most: int | None) -> Any:
-    """Steps with their ends at these times; where they are not known yet those of the controller, at most so many, written down."""
-    recorded: Any = RecordedSteps
-    followed: Any = FollowedSteps
-    return recorded(controller, most) if times is None else followed(controller, times)
-
-
-def taken(record: Record) -> Float[Array, " steps"]:
+def taken(ends: Ends) -> Float[Array, " steps"]:
     """The times at the ends of the steps that were accepted, and infinity."""
-    return lax.stop_gradient(jnp.where(jnp.arange(record.times.size) <= record.count, record.times, jnp.inf))
+    return lax.stop_gradient(jnp.where(jnp.arange(ends.times.size) <= ends.count, ends.times, jnp.inf))
 
 
 class _Followed(NamedTuple):
     steps: Any
     count: IntScalar
     end: Scalar
+
+
+def at_steps(controller: diffrax.AbstractStepSizeController, times: Float[Array, " steps"]) -> Any:
+    """The controller with its steps' ends at these times."""
+    followed: Any = FollowedSteps
+    return followed(controller, times)
 
 
 class FollowedSteps(AbstractStepsOf):

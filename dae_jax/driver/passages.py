@@ -7,7 +7,6 @@ They are not tried again with a smaller step: what really passes such a point, a
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -19,7 +18,7 @@ from ..equations.regularity import mass_is_regular, passes_singularity
 from ..equations.structural_ode import ORIENTED, StructuralODE
 from ..systems import is_mechanism
 from ..types import BoolLike, BoolScalar, Time, Y
-from .followed_steps import AbstractStepsOf
+from .observed_steps import Step
 from .problem import Problem
 
 
@@ -48,16 +47,17 @@ class Passage(eqx.Module):
     drifts: bool = eqx.field(static=True)
     masses: bool = eqx.field(static=True)
 
-    def begin(self, t: Time, y: Y, equations: Equations) -> Seen:
+    def begin(self, t0: Time, y0: Y, args: Equations) -> Seen:
         """Before the first step."""
         return Seen(jnp.asarray(False), True, None)
 
-    def __call__(self, t0: Time, y0: Y, t1: Time, y1: Y, equations: Equations, before: Seen) -> Seen:
-        at = lambda t, y: self.ode.encode(self.decode(t, y, equations))
-        start, end = at(t0, y0), at(t1, y1)
+    def __call__(self, step: Step, before: Seen) -> Seen:
+        at = lambda t, y: self.ode.encode(self.decode(t, y, step.args))
+        t0, t1 = step.direction * step.t0, step.direction * step.t1
+        start, end = at(t0, step.y0), at(t1, step.y1)
         passed = passes_singularity(self.ode, t0, start, t1, end, self.drifts)
         passed = passed | ~mass_is_regular(self.ode, end[0], False) if self.masses else passed
-        return Seen(before.passed | passed, True, None)
+        return _if_kept(step, Seen(before.passed | passed, True, None), before)
 
 
 class Undetermined(eqx.Module):
@@ -65,13 +65,14 @@ class Undetermined(eqx.Module):
     a determinant has another sign, and another value half-way. (Where the matrix jumps, with a switch, it has the value of one end.)
     """
 
-    def begin(self, t: Time, y: Y, equations: Equations) -> Seen:
+    def begin(self, t0: Time, y0: Y, args: Equations) -> Seen:
         """Before the first step, whose start is yet to be looked at."""
-        assert isinstance(equations, StructuralODE)
-        unknown = jnp.full((2, len(equations.oriented)), jnp.nan, jnp.result_type(t))
+        assert isinstance(args, StructuralODE)
+        unknown = jnp.full((2, len(args.oriented)), jnp.nan, jnp.result_type(t0))
         return Seen(jnp.asarray(False), jnp.asarray(True), unknown)
 
-    def __call__(self, t0: Time, y0: Y, t1: Time, y1: Y, equations: Equations, before: Seen) -> Seen:
+    def __call__(self, step: Step, before: Seen) -> Seen:
+        equations, t0, t1 = step.args, step.direction * step.t0, step.direction * step.t1
         assert isinstance(equations, StructuralODE)
 
         def goes_on(carry: Any) -> BoolScalar:
@@ -82,7 +83,7 @@ class Undetermined(eqx.Module):
         def look(carry: Any) -> Any:
             k, _, found = carry
             at = lambda a, b: jnp.where(k == 0, a, jnp.where(k == 1, b, (a + b) / 2))
-            determined, here = equations.determines_highest(at(t0, t1), jax.tree.map(at, y0, y1))
+            determined, here = equations.determines_highest(at(t0, t1), jax.tree.map(at, step.y0, step.y1))
             return (
                 k + 1,
                 jnp.where(k == 1, determined, carry[1]),
@@ -94,7 +95,8 @@ class Undetermined(eqx.Module):
         _, determined, (start, end, half_way) = lax.while_loop(goes_on, look, (first, jnp.asarray(True), marks))
         jumps = (jnp.abs(half_way[1] - start[1]) < ALIKE) | (jnp.abs(half_way[1] - end[1]) < ALIKE)
         passed = before.passed | jnp.any((end[0] * start[0] < 0) & ~jumps)
-        return Seen(passed, before.determined & determined, jnp.where(end[0] == 0, start, end))
+        after = Seen(passed, before.determined & determined, jnp.where(end[0] == 0, start, end))
+        return _if_kept(step, after, before)
 
 
 def passages(
@@ -113,67 +115,5 @@ def passages(
     return Passage(ode, decode, drifts, masses) if 0 < ode.holonomic + ode.nonholonomic <= ORIENTED else None
 
 
-def watched(controller: diffrax.AbstractStepSizeController, passage: Passage | Undetermined) -> "_AbstractWatchedSteps":
-    """The controller with an eye on passages."""
-    adapts = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
-    watched_steps: Any = WatchedAdaptiveSteps if adapts else WatchedSteps
-    return watched_steps(controller, passage)
-
-
-class _Watched(NamedTuple):
-    """The controller's state, and what was seen of the steps."""
-
-    steps: Any
-    seen: Seen
-
-
-class _AbstractWatchedSteps(diffrax.AbstractStepSizeController):
-    """The steps of another controller."""
-
-    steps: eqx.AbstractVar[Any]
-    passage: eqx.AbstractVar[Passage | Undetermined]
-    direction: eqx.AbstractVar[Any]
-
-    def wrap(self, direction: Any) -> Any:
-        return type(self)(self.steps.wrap(direction), self.passage, direction)
-
-    def init(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, error_order: Any
-    ) -> tuple[Any, _Watched]:
-        first, state = self.steps.init(terms, t0, t1, y0, dt0, args, func, error_order)
-        return first, _Watched(state, self.passage.begin(self.direction * t0, y0, args))
-
-    def adapt_step_size(
-        self,
-        t0: Any,
-        t1: Any,
-        y0: Any,
-        y1_candidate: Any,
-        args: Any,
-        y_error: Any,
-        error_order: Any,
-        controller_state: _Watched,
-    ) -> Any:
-        keep, *rest, state, result = self.steps.adapt_step_size(
-            t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state.steps
-        )
-        before = controller_state.seen
-        after = self.passage(self.direction * t0, y0, self.direction * t1, y1_candidate, args, before)
-        kept = jax.tree.map(lambda new, old: jnp.where(keep, new, old), after, before)
-        return keep, *rest, _Watched(state, kept), result
-
-
-class WatchedSteps(_AbstractWatchedSteps):
-    """Steps of a controller without tolerances."""
-
-    steps: Any
-    passage: Passage | Undetermined
-    direction: Any = 1
-
-
-class WatchedAdaptiveSteps(_AbstractWatchedSteps, AbstractStepsOf):
-    """Steps of a controller with tolerances."""
-
-    steps: Any
-    passage: Passage | Undetermined
-    direction: Any = 1
+def _if_kept(step: Step, after: Seen, before: Seen) -> Seen:
+    return jax.tree.map(lambda new, old: jnp.where(step.kept, new, old), after, before)

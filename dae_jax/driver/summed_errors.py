@@ -1,51 +1,39 @@
-"""Fixed steps whose errors are added up, where the method estimates them."""
+"""The errors of fixed steps added up, where the method estimates them."""
 
-from typing import Any
+from typing import NamedTuple
 
-import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import PyTree
 
-from ..types import Scalar
+from ..equations.manifold_ode import Equations
+from ..types import Scalar, Time, Y
+from .observed_steps import Step
 
 
-class SummedErrors(diffrax.AbstractStepSizeController):
-    """The steps of another controller, and the sum of their errors: each the largest of any part of the state, relative to the
-    largest that this part has been. It is the last of the controller's state.
-    """
+class Errors(NamedTuple):
+    """The largest that each part of the state has been, and the sum of the errors."""
 
-    steps: diffrax.AbstractStepSizeController
+    sizes: PyTree[Scalar]
+    total: Scalar
 
-    def wrap(self, direction: Any) -> "SummedErrors":
-        return SummedErrors(self.steps.wrap(direction))
 
-    def init(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, error_order: Any
-    ) -> tuple[Any, Any]:
-        t1, state = self.steps.init(terms, t0, t1, y0, dt0, args, func, error_order)
-        return t1, (state, _sizes(y0), jnp.zeros_like(t0))
+class SummedErrors(eqx.Module):
+    """The sum of the errors of steps: each the largest of any part of the state, relative to the largest that this part has been."""
 
-    def adapt_step_size(
-        self,
-        t0: Any,
-        t1: Any,
-        y0: Any,
-        y1_candidate: Any,
-        args: Any,
-        y_error: Any,
-        error_order: Any,
-        controller_state: Any,
-    ) -> Any:
-        state, sizes, total = controller_state
-        *out, state, result = self.steps.adapt_step_size(t0, t1, y0, y1_candidate, args, y_error, error_order, state)
-        if y_error is not None:
-            y1, error = lax.stop_gradient((y1_candidate, y_error))
-            sizes = jax.tree.map(jnp.maximum, sizes, _sizes(y1))
-            parts = jax.tree.map(lambda e, size: e / jnp.where(size > 0, size, 1), _sizes(error), sizes)
-            total = total + jnp.max(jnp.stack(jax.tree.leaves(parts)))
-        return *out, (state, sizes, total), result
+    def begin(self, t0: Time, y0: Y, args: Equations) -> Errors:
+        """Before the first step."""
+        return Errors(_sizes(y0), jnp.zeros_like(t0))
+
+    def __call__(self, step: Step, before: Errors) -> Errors:
+        if step.error is None:
+            return before
+        y1, error = lax.stop_gradient((step.y1, step.error))
+        sizes = jax.tree.map(jnp.maximum, before.sizes, _sizes(y1))
+        parts = jax.tree.map(lambda e, size: e / jnp.where(size > 0, size, 1), _sizes(error), sizes)
+        return Errors(sizes, before.total + jnp.max(jnp.stack(jax.tree.leaves(parts))))
 
 
 def _sizes(y: PyTree) -> PyTree[Scalar]:
