@@ -64,8 +64,13 @@ def refuse_wrong_functions(system: System, t: Time, state: State, args: Args) ->
         _refuse(system, t, state, args)
     except ValueError as refusal:
         advice = time_axis_advice(system, t, state, args)
-        if not advice and any(type(x) is list for x in jax.tree.leaves(state, is_leaf=lambda x: type(x) is list)):
-            advice = "`y0` holds lists, which are no arrays: write jnp.array([1.0, 0.0]) in place of [1.0, 0.0]."
+        is_row = lambda x: (
+            type(x) is list or (type(x) is tuple and x is not state and all(isinstance(e, int | float) for e in x))
+        )
+        row = next(filter(is_row, jax.tree.leaves(state, is_leaf=is_row)), None)
+        if not advice and row is not None:
+            named = f"{type(row).__name__}s of numbers"
+            advice = f"`y0` holds {named}, which are no arrays: write jnp.array([1.0, 0.0]) in place of {type(row)((1.0, 0.0))}."
         if advice:
             raise ValueError(f"{advice}\n({refusal})") from refusal
         raise
