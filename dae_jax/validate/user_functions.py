@@ -64,9 +64,7 @@ def refuse_wrong_functions(system: System, t: Time, state: State, args: Args) ->
         _refuse(system, t, state, args)
     except ValueError as refusal:
         advice = time_axis_advice(system, t, state, args)
-        is_row = lambda x: (
-            type(x) is list or (type(x) is tuple and x is not state and all(isinstance(e, int | float) for e in x))
-        )
+        is_row = lambda x: type(x) is list or (type(x) is tuple and x is not state and all(map(_is_number, x)))
         row = next(filter(is_row, jax.tree.leaves(state, is_leaf=is_row)), None)
         if not advice and row is not None:
             named = f"{type(row).__name__}s of numbers"
@@ -74,6 +72,10 @@ def refuse_wrong_functions(system: System, t: Time, state: State, args: Args) ->
         if advice:
             raise ValueError(f"{advice}\n({refusal})") from refusal
         raise
+
+
+def _is_number(x: object) -> bool:
+    return isinstance(x, NUMBERS) and not jnp.ndim(x)
 
 
 def time_axis_advice(system: System, t: Time, state: State, args: Args) -> str:
