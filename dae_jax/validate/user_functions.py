@@ -75,7 +75,7 @@ def refuse_wrong_functions(system: System, t: Time, state: State, args: Args) ->
 
 
 def _is_number(x: object) -> bool:
-    return isinstance(x, NUMBERS) and not jnp.ndim(x)
+    return isinstance(x, NUMBERS) and not np.shape(x)
 
 
 def time_axis_advice(system: System, t: Time, state: State, args: Args) -> str:
