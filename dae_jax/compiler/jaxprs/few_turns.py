@@ -25,6 +25,8 @@ class Range(NamedTuple):
 
 # What makes a variable, if anything does.
 Made = Callable[[Any], Equation | None]
+# Selections within selections that are looked through.
+DEPTH = 4
 ALWAYS, NEVER, SOMETIMES = Range(1, 1), Range(0, 0), Range(0, 1)
 
 
@@ -63,15 +65,15 @@ def _is_start(aval: Aval, r: Range) -> bool:
     return aval.dtype.kind == "i" and r.greatest - r.least <= 1 and largest < np.iinfo(aval.dtype).max
 
 
-def _range(x: Atom, made: Made) -> Range | None:
+def _range(x: Atom, made: Made, depth: int = DEPTH) -> Range | None:
     aval = aval_of(x)
-    if aval.shape or aval.dtype.kind not in "ib":
+    if aval.shape or aval.dtype.kind not in "ib" or not depth:
         return None
     if isinstance(x, Literal):
         return Range(int(x.val), int(x.val))
     eqn = made(x)
     chosen = () if eqn is None else eqn.invars[1:] if eqn.primitive.name == "select_n" else ()
-    of = [_range(v, made) for v in chosen]
+    of = [_range(v, made, depth - 1) for v in chosen]
     known = [r for r in of if r is not None]
     if known and len(known) == len(of):
         return Range(min(r.least for r in known), max(r.greatest for r in known))
