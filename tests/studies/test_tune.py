@@ -205,3 +205,17 @@ def test_history_can_be_drawn(tmp_path):
     tuned = dae_jax.tune(lambda p: jnp.log(p["a"]) ** 2, {"a": 3.0}, steps=10, starts=3, progress=False)
     plotting.tuning(tuned.history).savefig(tmp_path / "history.png")
     assert (tmp_path / "history.png").stat().st_size > 10_000
+
+
+def test_the_loss_has_derivatives_of_both_modes():
+    """For an optimiser of the user's own."""
+    scene = SCENES["pendulum"]()
+    loss = jax.jit(dae_jax.baumgarte_loss(scene.system, scene.y0, 2.0, dt0=0.02))
+    at, h = {"alpha": 20.0, "beta": 20.0}, 1e-2
+    moved = lambda name, by: float(loss({**at, name: at[name] + by}))
+    for derivative in (jax.grad, jax.jacfwd):
+        found = derivative(loss)(at)
+        for name in at:
+            np.testing.assert_allclose(found[name], (moved(name, h) - moved(name, -h)) / (2 * h), rtol=1e-5)
+    rows = {k: jnp.array([x, 2 * x]) for k, x in at.items()}
+    np.testing.assert_allclose(jax.vmap(jax.grad(loss))(rows)["beta"][0], jax.grad(loss)(at)["beta"], rtol=1e-12)
