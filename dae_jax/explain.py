@@ -198,7 +198,7 @@ def explain(
 ) -> Plan:
     """How `daesolve` would solve this, with the same arguments; nothing is solved.
 
-    Errors: those of `daesolve` for wrong input.
+    Errors: those of `daesolve` for wrong input; `ValueError` within `jit`, `vmap` and `grad` of what is looked at.
     """
     refuse_no_time("t0", t0)
     dt0 = None if isinstance(solver, diffrax.AbstractAdaptiveSolver) else 1e-3

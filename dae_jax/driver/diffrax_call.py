@@ -128,9 +128,11 @@ def call(solve: "Solve", problem: Problem, steps: Float[Array, " steps"] | None 
     result = RESULTS.where(starts, RESULTS.promote(sol.result), RESULTS.no_finite_start)
     stats.update((path.split(".")[-1], operator.attrgetter(path)(sol.solver_state)) for path in counts(solver))
     found = lax.stop_gradient(cast(Any, sol.controller_state)).seen if observers else {}
-    passed, determined, _ = found.get("passage", (False, True, None))
-    result = RESULTS.where((result == RESULTS.successful) & ~jnp.asarray(determined), RESULTS.undetermined, result)
-    seen = found["errors"].total if sums_errors else None, passed
+    passed = False
+    if "passage" in found:
+        passed, determined, _ = found["passage"]
+        result = RESULTS.where((result == RESULTS.successful) & ~jnp.asarray(determined), RESULTS.undetermined, result)
+    seen = found["errors"].total if "errors" in found else None, passed
     times = taken(found["ends"]) if "ends" in found else steps
     return sol.t0, sol.t1, ts["user"], ys["user"], interpolation, stats, result, sol.event_mask, seen, end, times
 

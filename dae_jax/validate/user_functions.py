@@ -4,7 +4,7 @@ import functools
 import inspect
 import types
 from collections.abc import Callable, Hashable
-from typing import Any, TypeVar, cast
+from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
@@ -33,22 +33,23 @@ LEADING_AXIS = (
 )
 
 
-F = TypeVar("F", bound=Callable[..., Any])
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
-def at_numbers(fn: F) -> F:
+def at_numbers(fn: Callable[P, T]) -> Callable[P, T]:
     """A function that looks at the numbers it is given, or that the user's functions close over; what traces them is refused."""
 
     @functools.wraps(fn)
-    def checked(*args: Any, **options: Any) -> Any:
+    def checked(*args: P.args, **kwargs: P.kwargs) -> T:
         try:
-            return fn(*args, **options)
+            return fn(*args, **kwargs)
         except TRACED as error:
             raise ValueError(
                 f"`{fn.__name__}` looks at numbers, which are not known within `jit`, `vmap` and `grad`: call it outside of them."
             ) from error
 
-    return cast("F", checked)
+    return checked
 
 
 # The last functions that have been seen to have the same numbers in them each time they are called, by their keys.
@@ -67,7 +68,7 @@ def refuse_wrong_functions(system: System, t: Time, state: State, args: Args) ->
         is_row = lambda x: type(x) is list or (type(x) is tuple and x is not state and all(map(_is_number, x)))
         row = next(filter(is_row, jax.tree.leaves(state, is_leaf=is_row)), None)
         if not advice and row is not None:
-            named = f"{type(row).__name__}s of numbers"
+            named = "lists" if type(row) is list else "tuples of numbers"
             advice = f"`y0` holds {named}, which are no arrays: write jnp.array([1.0, 0.0]) in place of {type(row)((1.0, 0.0))}."
         if advice:
             raise ValueError(f"{advice}\n({refusal})") from refusal

@@ -66,19 +66,11 @@ NOT_KNOWN = {
 }
 
 
-@pytest.mark.parametrize("name", FEW)
-def test_few_turns_are_written_out(name):
-    goes_on, options = FEW[name]
+@pytest.mark.parametrize("name", [*FEW, *NOT_KNOWN])
+def test_few_turns_are_written_out_and_others_stay_loops(name):
+    goes_on, options = (FEW | NOT_KNOWN)[name]
     fn = loop(goes_on, **options)
-    assert whiles(fn, True, 0.3) == 0
-    as_by_jax(fn)
-
-
-@pytest.mark.parametrize("name", NOT_KNOWN)
-def test_others_stay_loops(name):
-    goes_on, options = NOT_KNOWN[name]
-    fn = loop(goes_on, **options)
-    assert whiles(fn, True, 0.3) == 1
+    assert whiles(fn, True, 0.3) == (name in NOT_KNOWN)
     as_by_jax(fn)
 
 

@@ -135,7 +135,7 @@ STATES = {
     "words": (started(("left", "fast")), "`y0` must hold arrays of floating-point numbers, but holds 'left'."),
     "one vector": (started(jnp.zeros(4)), "if v is behind q in it, write `y0=(y[:2], y[2:])`."),
     "three parts": (started((Q0, V0, V0)), "`y0` must be the pair (q, v) of positions and velocities"),
-    "lists": (started(([1.0, 0.0], [0.0, 0.0])), "`y0` holds lists of numbers, which are no arrays: write jnp.array([1.0, 0.0]) in place of [1.0, 0.0]."),
+    "lists": (started(([1.0, 0.0], [0.0, 0.0])), "`y0` holds lists, which are no arrays: write jnp.array([1.0, 0.0]) in place of [1.0, 0.0]."),
     "tuples": (started(((1.0, 0.0), (0.0, 0.0))), "`y0` holds tuples of numbers, which are no arrays: write jnp.array([1.0, 0.0]) in place of (1.0, 0.0)."),
     "a solution": (lambda: solve(y0=solved()), "`y0` must be a state, but is a solution: go on from its last state with `y0=sol.final`."),
     "with its time axis": (lambda: solve(y0=solved().ys), "`y0` must be one state, but has a leading axis of length 1: a time axis as in `sol.ys`, or a batch. Go on from the last saved state with `y0=sol.final`, that is `jax.tree.map(lambda x: x[-1], sol.ys)`; solve a batch with `jax.vmap`."),

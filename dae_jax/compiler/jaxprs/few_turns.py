@@ -30,7 +30,9 @@ DEPTH = 4
 ALWAYS, NEVER, SOMETIMES = Range(1, 1), Range(0, 0), Range(0, 1)
 
 
-def written_out(eqn: Equation, args: list[Atom], made: Made, inlined: Callable[[ClosedJaxpr], ClosedJaxpr]) -> Any:
+def written_out(
+    eqn: Equation, args: list[Atom], made: Made, inlined: Callable[[ClosedJaxpr], ClosedJaxpr]
+) -> ClosedJaxpr | None:
     """A `while` as a function of its operands, its turns one after another; `None` where they are not few, or not known.
 
     **Arguments**
@@ -42,15 +44,17 @@ def written_out(eqn: Equation, args: list[Atom], made: Made, inlined: Callable[[
     n, m = p["cond_nconsts"], p["body_nconsts"]
     carry = args[n + m :]
     starts = [_range(x, made) for x in carry]
-    narrow = [k for k, (x, r) in enumerate(zip(carry, starts, strict=True)) if r and _is_start(aval_of(x), r)]
+    narrow = {k: r for k, (x, r) in enumerate(zip(carry, starts, strict=True)) if r and _is_start(aval_of(x), r)}
     if not narrow:
         return None
     condition, body = inlined(p["cond_jaxpr"]), inlined(p["body_jaxpr"])
     counters, limit = _counters(body, m), THRESHOLDS.turns_written_out // (1 + _numbers(body))
+    counted = [r if k in counters else None for k, r in enumerate(starts)]
     for main in filter(counters.__contains__, narrow):
-        last = _last(condition, n, starts, counters, main, limit)
+        first = narrow[main]
+        last = _last(condition, n, counted, main, first, limit)
         if last is not None:
-            return _turns(p, starts[main], main, last, list(map(aval_of, args)))
+            return _turns(p, first, main, last, list(map(aval_of, args)))
     return None
 
 
@@ -96,18 +100,15 @@ def _counters(body: ClosedJaxpr, consts: int) -> frozenset[int]:
 
 
 def _last(
-    condition: ClosedJaxpr, consts: int, starts: list[Range | None], counters: frozenset[int], main: int, limit: int
+    condition: ClosedJaxpr, consts: int, counted: list[Range | None], main: int, first: Range, limit: int
 ) -> int | None:
-    """The value of the main counter at which the loop ends, in every case, where all smaller ones are turns."""
-    first = starts[main]
-    assert first is not None
+    """The value of the main counter at which the loop ends, in every case, where all smaller ones are turns; `counted`: where each
+    counter starts.
+    """
     for now in range(first.least, first.least + limit + 1):
         # So many turns have been done.
         fewest, most = max(now - first.greatest, 0), now - first.least
-        carry = [
-            Range(r.least + fewest, r.greatest + most) if r is not None and k in counters else None
-            for k, r in enumerate(starts)
-        ]
+        carry = [r and Range(r.least + fewest, r.greatest + most) for r in counted]
         carry[main] = Range(now, now)
         goes_on = _value(condition, [*[None] * consts, *carry])
         if goes_on != ALWAYS:
@@ -136,8 +137,7 @@ def _result(eqn: Equation, x: list[Any]) -> Range | None:
     return Range(int(a.greatest + by <= b.least), int(a.least + by <= b.greatest))
 
 
-def _turns(p: Params, first: Range | None, main: int, last: int, avals: list[Aval]) -> ClosedJaxpr:
-    assert first is not None
+def _turns(p: Params, first: Range, main: int, last: int, avals: list[Aval]) -> ClosedJaxpr:
     body, consts = jaxpr_as_fun(p["body_jaxpr"]), p["cond_nconsts"]
 
     def loop(*xs: Array) -> list[Any]:
