@@ -42,9 +42,9 @@ class Thresholds:
       5 s in place of 24, with a third less that does not fit into registers; of 8 links (25,000) 5 in place of 8.
     - `overestimate`: the estimate counts up to this many instructions for each that is written, since it knows of no zeros and of
       nothing that is there twice. In between the function is written to see.
-    - `whole`, `procedure`: in a program of more than `whole` instructions a function that is called at several places is a
-      procedure if it has more than `procedure`. A Stewart platform takes 180,000 instructions in place of 350,000: ready in 16 s,
-      1.5 ms a step; by XLA in 25 s, 3.4 ms.
+    - `whole`, `procedure`: in a program of more than `whole` instructions, before equal ones are found (a quarter
+      to two thirds are left), a function that is called at several places is a procedure if it has more than `procedure`. A Stewart
+      platform takes 180,000 instructions in place of 350,000: ready in 16 s, 1.5 ms a step; by XLA in 25 s, 3.4 ms.
     - `loop_cost`: a loop over an array takes about as many instructions as this many entries do.
     """
 
@@ -67,7 +67,7 @@ class Thresholds:
     instructions: int = 200_000
     ptx_lines: int = 20_000
     overestimate: int = 4
-    whole: int = 200_000
+    whole: int = 300_000
     procedure: int = 500
     loop_cost: int = 12
 

@@ -21,7 +21,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import PyTree
 
 from ..compiler import at_ease, processors
-from ..compiler.jaxprs.walk import equations, jaxprs_in
+from ..compiler.jaxprs.walk import equations, held_by
 from ..driver.failures import sentence_of
 from ..solution import RESULTS
 from ..types import State
@@ -262,7 +262,7 @@ def _fingerprint(fn: Callable[..., PyTree], elements: PyTree, chunk: int) -> str
     """What makes two sweeps the same: the function as it is traced, its constants at any depth, the elements, and the chunks."""
     closed = jax.make_jaxpr(fn)(_one(elements))
     found = hashlib.sha256(re.sub(r"0x[0-9a-f]+", "", str(closed)).encode())
-    inner = (jaxpr for eqn in equations(closed) for jaxpr in jaxprs_in(tuple(eqn.params.values())))
+    inner = (jaxpr for eqn in equations(closed) for jaxpr in held_by(eqn))
     constants = (x for jaxpr in (closed, *inner) if isinstance(jaxpr, ClosedJaxpr) for x in jaxpr.consts)
     for x in [*constants, *jax.tree.leaves(elements)]:
         x = np.asarray(x)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dae_jax import compiler
-from dae_jax.compiler.jaxprs.inline import inlined
+from dae_jax.compiler.jaxprs.inline import Inlining
 from dae_jax.compiler.jaxprs.walk import equations
 
 
@@ -27,7 +27,7 @@ def loop(goes_on, moves=1, start=(1, 0), dtype=int):
 
 
 def whiles(fn, *args):
-    closed = inlined(jax.make_jaxpr(fn)(*args))
+    closed = Inlining()(jax.make_jaxpr(fn)(*args))
     return [eqn.primitive.name for eqn in equations(closed)].count("while")
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from dae_jax.compiler import kernel_call, one_kernel
 from dae_jax.compiler.emit.target import vector_size
-from dae_jax.compiler.jaxprs.inline import inlined
+from dae_jax.compiler.jaxprs.inline import Inlining
 from dae_jax.compiler.jaxprs.scalar_interpreter import Unsupported
 from dae_jax.compiler.lower import annotate, compiled, hindrances, unsupported, written
 from dae_jax.compiler.lower.lane_queue import main_loop
@@ -315,7 +315,7 @@ def test_lanes_are_refilled(shared, count):
     times = np.linspace(1, 2, 30) if shared else random.uniform(1, 2, (count, 30))
     batched = (True, not shared)
     jaxpr = jax.make_jaxpr(stepping)(X, np.ones(30))
-    assert main_loop(inlined(jaxpr)) is not None
+    assert main_loop(Inlining()(jaxpr)) is not None
     assert "ctpop" in written(jaxpr, batched)
     found = jax.jit(compiled(jaxpr, batched))(xs, times)
     expected = jax.jit(jax.vmap(stepping, (0, None if shared else 0)))(xs, times)
@@ -330,7 +330,7 @@ def test_a_loop_as_long_for_all_lanes_is_shared():
         )
 
     jaxpr = jax.make_jaxpr(fn)(X, np.abs(X))
-    assert main_loop(inlined(jaxpr)) is not None
+    assert main_loop(Inlining()(jaxpr)) is not None
     assert "ctpop" not in written(jaxpr, (True, False))
     assert "ctpop" in written(jaxpr, (False, True))
     xs = X * np.arange(1, LANES + 1)[:, None]
@@ -340,8 +340,8 @@ def test_a_loop_as_long_for_all_lanes_is_shared():
 
 
 def test_a_loop_that_is_little_of_the_work_is_not_taken_apart():
-    assert main_loop(inlined(jax.make_jaxpr(flat(elementary))(X))) is None
-    assert main_loop(inlined(jax.make_jaxpr(flat(loops))(X))) is None
+    assert main_loop(Inlining()(jax.make_jaxpr(flat(elementary))(X))) is None
+    assert main_loop(Inlining()(jax.make_jaxpr(flat(loops))(X))) is None
 
 
 def test_equal_equations_are_written_once():
@@ -349,7 +349,7 @@ def test_equal_equations_are_written_once():
         call = jax.jit(lambda y: jnp.sin(y) * 2.0)
         return call(x) + call(x), jnp.sin(x) * -0.0, jnp.sin(x) * 0.0, jnp.cos(x)[:0]
 
-    names = [eqn.primitive.name for eqn in inlined(jax.make_jaxpr(fn)(X)).jaxpr.eqns]
+    names = [eqn.primitive.name for eqn in Inlining()(jax.make_jaxpr(fn)(X)).jaxpr.eqns]
     assert names.count("sin") == 1
     assert names.count("mul") == 3
     assert "jit" not in names

@@ -23,7 +23,6 @@ X, C = np.linspace(0.1, 0.6, 6), np.ones((6, 6))
 @pytest.fixture(autouse=True)
 def everything_is_a_procedure(monkeypatch):
     everything = dataclasses.replace(THRESHOLDS, whole=-1, procedure=1)
-    monkeypatch.setattr("dae_jax.compiler.lower.judge.THRESHOLDS", everything)
     monkeypatch.setattr("dae_jax.compiler.lower.repeated.THRESHOLDS", everything)
 
 

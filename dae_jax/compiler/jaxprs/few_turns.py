@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from ..thresholds import THRESHOLDS
 from ..types import Atom, Aval, Equation, Params, aval_of
-from .walk import equations
+from .walk import numbers_computed
 
 
 class Range(NamedTuple):
@@ -48,7 +48,7 @@ def written_out(
     if not narrow:
         return None
     condition, body = inlined(p["cond_jaxpr"]), inlined(p["body_jaxpr"])
-    counters, limit = _counters(body, m), THRESHOLDS.turns_written_out // (1 + _numbers(body))
+    counters, limit = _counters(body, m), THRESHOLDS.turns_written_out // (1 + numbers_computed(body))
     counted = [r if k in counters else None for k, r in enumerate(starts)]
     for main in filter(counters.__contains__, narrow):
         first = narrow[main]
@@ -56,11 +56,6 @@ def written_out(
         if last is not None:
             return _turns(p, first, main, last, list(map(aval_of, args)))
     return None
-
-
-def _numbers(body: ClosedJaxpr) -> int:
-    """How many numbers a turn computes."""
-    return sum(v.aval.size for eqn in equations(body) for v in eqn.outvars if hasattr(v.aval, "size"))
 
 
 def _is_start(aval: Aval, r: Range) -> bool:

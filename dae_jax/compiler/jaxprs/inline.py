@@ -32,9 +32,26 @@ PROCEDURE = Primitive("procedure")
 PROCEDURE.multiple_results = True
 
 
-def inlined(closed: ClosedJaxpr, procedures: frozenset[Hashable] = frozenset()) -> ClosedJaxpr:
-    """A jaxpr that computes the same; functions with the identities `procedures` stay functions."""
-    flat = _Flat(procedures)
+class Inlining:
+    """Jaxprs without calls but those of procedures, each found once.
+
+    Called with a jaxpr it gives one that computes the same; functions with the identities `procedures` stay functions.
+    """
+
+    def __init__(self, procedures: frozenset[Hashable] = frozenset()) -> None:
+        self.procedures = procedures
+        self._known: dict[Hashable, tuple[ClosedJaxpr, ClosedJaxpr]] = {}
+
+    def __call__(self, closed: ClosedJaxpr) -> ClosedJaxpr:
+        key = identity(closed)
+        if key not in self._known:
+            # The first is kept so that its identity is nobody else's.
+            self._known[key] = closed, _flat(closed, self)
+        return self._known[key][1]
+
+
+def _flat(closed: ClosedJaxpr, inlined: Inlining) -> ClosedJaxpr:
+    flat = _Flat(inlined)
     inputs = [Var(v.aval) for v in closed.jaxpr.invars]
     outputs = flat.run(closed, inputs)
     needed, eqns = {v for v in outputs if isinstance(v, Var)}, []
@@ -48,8 +65,8 @@ def inlined(closed: ClosedJaxpr, procedures: frozenset[Hashable] = frozenset()) 
 
 
 class _Flat:
-    def __init__(self, procedures: frozenset[Hashable]) -> None:
-        self.procedures = procedures
+    def __init__(self, inlined: Inlining) -> None:
+        self.inlined = inlined
         self.eqns: list[JaxprEqn] = []
         self.constants: dict[int, tuple[Var, Any]] = {}
         self._known: dict[Hashable, list[Any]] = {}
@@ -68,7 +85,7 @@ class _Flat:
     def _equation(self, eqn: JaxprEqn, args: list[Atom]) -> list[Any]:
         name, p = eqn.primitive.name, eqn.params
         inner = called(eqn)
-        if inner is not None and identity(inner) not in self.procedures:
+        if inner is not None and identity(inner) not in self.inlined.procedures:
             return self.run(inner, args)
         if inner is not None:
             eqn, name = eqn.replace(primitive=PROCEDURE, params={"jaxpr": inner}), PROCEDURE.name
@@ -83,7 +100,7 @@ class _Flat:
             return args[:1] if scalar else self.run(_meaning(eqn), args)
         if name == "while" and eqn.params["cond_jaxpr"].out_avals[0].shape:
             eqn, args = _until_all_are_done(eqn, args)
-        if name == "while" and (turns := written_out(eqn, args, self._made.get, inlined)) is not None:
+        if name == "while" and (turns := written_out(eqn, args, self._made.get, self.inlined)) is not None:
             return self.run(turns, args)
         if name in _SAME_IF_SO_SHAPED and _like(aval_of(args[0]), aval_of(eqn.outvars[0])):
             return args[:1]

@@ -40,11 +40,12 @@ _PLAIN_KINDS = int | float | str | np.dtype | np.generic | enum.Enum | None
 
 # They are asked for at each level, of programs that do not change.
 _known: weakref.WeakKeyDictionary[Jaxpr, tuple[Any, ...]] = weakref.WeakKeyDictionary()
+_computed: weakref.WeakKeyDictionary[Jaxpr, int] = weakref.WeakKeyDictionary()
 
 
 def equations(jaxpr: ClosedJaxpr | Jaxpr) -> tuple[Any, ...]:
     """The equations of a jaxpr, at any depth."""
-    inner: Any = jaxpr.jaxpr if isinstance(jaxpr, ClosedJaxpr) else jaxpr
+    inner = _opened(jaxpr)
     if inner not in _known:
         every: list[Any] = []
         for eqn in inner.eqns:
@@ -54,14 +55,34 @@ def equations(jaxpr: ClosedJaxpr | Jaxpr) -> tuple[Any, ...]:
     return _known[inner]
 
 
+def _opened(jaxpr: ClosedJaxpr | Jaxpr) -> Any:
+    return jaxpr.jaxpr if isinstance(jaxpr, ClosedJaxpr) else jaxpr
+
+
+def numbers_computed(jaxpr: ClosedJaxpr | Jaxpr) -> int:
+    """How many numbers the equations of a jaxpr give, at any depth."""
+    inner = _opened(jaxpr)
+    if inner not in _computed:
+        own = sum(out.aval.size for eqn in inner.eqns for out in eqn.outvars if hasattr(out.aval, "size"))
+        _computed[inner] = own + sum(numbers_computed(x) for eqn in inner.eqns for x in held_by(eqn))
+    return _computed[inner]
+
+
 def equations_in(eqn: Equation) -> list[Any]:
     """The equations of all jaxprs that an equation holds."""
-    found: list[Any] = []
+    return [inner for jaxpr in held_by(eqn) for inner in equations(jaxpr)]
+
+
+def held_by(eqn: Equation) -> Iterator[ClosedJaxpr | Jaxpr]:
+    """The jaxprs that an equation holds."""
     for param in eqn.params.values():
         if type(param) not in _PLAIN:
-            for jaxpr in jaxprs_in(param):
-                found += equations(jaxpr)
-    return found
+            yield from jaxprs_in(param)
+
+
+def closed_in(eqn: Equation) -> Iterator[ClosedJaxpr]:
+    """The closed ones, such as those that a loop or a branch runs."""
+    return (x for x in held_by(eqn) if isinstance(x, ClosedJaxpr))
 
 
 def jaxprs_in(param: object) -> Iterator[ClosedJaxpr | Jaxpr]:
@@ -98,5 +119,4 @@ def of_solve(p: Params, args: list[T]) -> list[T]:
 
 def is_large(fn: Callable[..., Any], *args: PyTree) -> bool:
     """Whether a function is better called at one place, in a loop: XLA compiles it anew for each place it is called at."""
-    found = equations(jax.make_jaxpr(fn)(*args))
-    return sum(out.aval.size for eqn in found for out in eqn.outvars if hasattr(out.aval, "size")) > LARGE
+    return numbers_computed(jax.make_jaxpr(fn)(*args)) > LARGE

@@ -6,7 +6,7 @@ from typing import Any
 from jax.extend.core import ClosedJaxpr
 
 from ..emit.target import Target
-from .inlining import Inlining
+from ..jaxprs.inline import Inlining
 from .registry import quoted
 
 

@@ -9,13 +9,13 @@ from jax.extend.core import ClosedJaxpr, Literal, Var
 
 from .._compat import scan_counts
 from ..emit.target import Target
+from ..jaxprs.inline import Inlining
 from ..jaxprs.numbers import is_on_numbers
 from ..jaxprs.walk import equations
 from ..thresholds import THRESHOLDS
 from ..types import Aval, Equation
 from .annotated import Annotated, Note
 from .dtypes import BYTES, parts_of
-from .inlining import Inlining
 from .registry import RULES, size
 from .uniformity import results
 

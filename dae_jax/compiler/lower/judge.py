@@ -9,14 +9,15 @@ from jax.extend.core import ClosedJaxpr
 
 from ..emit import available
 from ..emit.target import Target, host
+from ..jaxprs.inline import Inlining
 from ..jaxprs.random_keys import without_keys
 from ..jaxprs.scalar_interpreter import Unsupported
+from ..jaxprs.walk import closed_in
 from ..thresholds import THRESHOLDS
 from ..types import Equation
 from . import estimate, rules as rules
 from .annotated import Annotated
 from .dtypes import ALL
-from .inlining import Inlining, inner
 from .lowering import TooLarge
 from .module_text import module_text
 from .registry import RULES, named, quoted
@@ -48,16 +49,10 @@ def unsupported(
 
 @functools.lru_cache(maxsize=4)
 def _annotated(jaxpr: ClosedJaxpr, batched: tuple[bool, ...], target: Target) -> Annotated | Unsupported:
-    whole, inlined = without_keys(jaxpr), Inlining()
+    whole = without_keys(jaxpr)
+    inlined = Inlining(frozenset() if target.threads else repeated(whole))
     found = next(_unsupported(inlined(whole), inlined, target), None)
-    if found is not None:
-        return found
-    annotated = estimate.annotated(inlined(whole), batched, inlined, target)
-    if annotated.cost > THRESHOLDS.whole and not target.threads:
-        # Not where the whole is small enough: a function is faster by a fifth as a part of its surroundings.
-        inlined = Inlining(repeated(whole))
-        annotated = estimate.annotated(inlined(whole), batched, inlined, target)
-    return _unless_too_large(annotated)
+    return found or _unless_too_large(estimate.annotated(inlined(whole), batched, inlined, target))
 
 
 def _unsupported(jaxpr: ClosedJaxpr, inlined: Inlining, target: Target | None) -> Iterator[Unsupported]:
@@ -77,7 +72,7 @@ def _unsupported_within(jaxpr: ClosedJaxpr, inlined: Inlining, target: Target | 
         if reason:
             yield Unsupported(reason, quoted(eqn), eqn.primitive.name)
         elif RULES[eqn.primitive.name].nested:
-            for body in inner(eqn):
+            for body in closed_in(eqn):
                 yield from _unsupported_within(inlined(body), inlined, target)
 
 

@@ -7,6 +7,7 @@ from jax.extend.core import ClosedJaxpr
 from jax.typing import ArrayLike
 
 from ..emit.target import Target
+from ..jaxprs.inline import Inlining
 from ..jaxprs.numbers import on_numbers
 from ..jaxprs.objects import is_number, objects
 from ..thresholds import THRESHOLDS
@@ -16,7 +17,6 @@ from .arrays import Buffer, Operand, View, row_major
 from .context import Context
 from .dtypes import parts_of
 from .environment import Environment
-from .inlining import Inlining
 from .instructions import Instructions
 from .memory import Memory
 from .procedures import Procedures

@@ -1,11 +1,11 @@
-"""Which functions of a program become procedures: those that are called at several places, and are large."""
+"""Which functions of a large program become procedures: those that are called at several places, and are large."""
 
 from collections import Counter
 from collections.abc import Hashable, Iterator
 
 from jax.extend.core import ClosedJaxpr
 
-from ..jaxprs.walk import called, identity, jaxprs_in
+from ..jaxprs.walk import called, closed_in, identity
 from ..thresholds import THRESHOLDS
 from ..types import Equation
 from .registry import RULES
@@ -14,7 +14,10 @@ from .registry import RULES
 def repeated(closed: ClosedJaxpr) -> frozenset[Hashable]:
     """The identities of these functions."""
     functions: dict[Hashable, tuple[int, Counter[tuple[Hashable, bool]]]] = {}
-    _visit(closed, functions)
+    _, whole = _visit(closed, functions)
+    if whole <= THRESHOLDS.whole:
+        # A function is faster by a fifth as a part of its surroundings.
+        return frozenset()
     places, found = Counter({identity(closed): 1}), set()
     # Who calls comes after what it calls.
     for function, (size, held) in reversed(functions.items()):
@@ -52,7 +55,7 @@ def _held(eqn: Equation) -> Iterator[tuple[ClosedJaxpr, bool]]:
     elif eqn.primitive.name == "custom_linear_solve":
         yield eqn.params["jaxprs"].solve, False
     else:
-        yield from ((x, False) for x in jaxprs_in(tuple(eqn.params.values())) if isinstance(x, ClosedJaxpr))
+        yield from ((x, False) for x in closed_in(eqn))
 
 
 def _size(eqn: Equation) -> int:
