@@ -18,6 +18,11 @@ def messages(enumeration: type) -> list[str]:
     return getattr(enumeration, "_index_to_message")  # noqa: B009
 
 
+def lacks_reverse_derivatives(error: ValueError) -> bool:
+    """Whether a function was differentiated in reverse that has forward derivatives only."""
+    return str(error).startswith("Linearization failed")
+
+
 def is_captured(error: TypeError) -> bool:
     """Whether a compiled function closes over a number that is being differentiated."""
     return str(error).startswith("No constant handler for type") and "Tracer" in str(error)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from .._compat import is_captured, trace_state_clean
+from .._compat import is_captured, lacks_reverse_derivatives, trace_state_clean
 from ..compiler import PullBack, inexact, one_kernel, one_kernel_enabled, waiting
 from ..compiler.types import Arrays
 from ..equations.independent import independent
@@ -90,6 +90,13 @@ def run(program: Program, arrays: Arrays) -> tuple[DAESolution, Any, float]:
             raise TypeError(
                 "A number that is being differentiated is held by an object that is no pytree (an attribute, a global "
                 "variable), where the solve cannot see it. Hand it over through `args`, or make the object an `equinox.Module`."
+            ) from error
+        raise
+    except ValueError as error:
+        if lacks_reverse_derivatives(error):
+            raise TypeError(
+                "With `adjoint=diffrax.ForwardMode()`, which a Lyapunov exponent is found with too, there are forward derivatives "
+                "only: `jax.jvp`, `jax.jacfwd`. For `jax.grad` leave `adjoint` out."
             ) from error
         raise
     finally:

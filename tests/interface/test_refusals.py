@@ -203,6 +203,7 @@ METHODS = {
     "adjoint a class": (given(adjoint=diffrax.ForwardMode), "`adjoint` must be a diffrax adjoint such as diffrax.ForwardMode(), but is the class ForwardMode"),
     "adjoint in words": (given(adjoint="forward"), "`adjoint` must be a diffrax adjoint such as diffrax.ForwardMode(), but is 'forward'."),
     "backsolve": (given(adjoint=diffrax.BacksolveAdjoint()), "`adjoint` must not be BacksolveAdjoint, which knows nothing of the constraints: use the default, RecursiveCheckpointAdjoint(), for reverse mode, and ForwardMode() for forward mode."),
+    "forward derivatives in reverse": (lambda: jax.grad(lambda a: solve(y0=(Q0, V0 * a), adjoint=diffrax.ForwardMode()).final[0][0])(1.0), "With `adjoint=diffrax.ForwardMode()`, which a Lyapunov exponent is found with too, there are forward derivatives only: `jax.jvp`, `jax.jacfwd`. For `jax.grad` leave `adjoint` out."),
     "implicit adjoint": (given(adjoint=diffrax.ImplicitAdjoint()), "`adjoint` must not be ImplicitAdjoint"),
     "progress meter a class": (given(progress_meter=diffrax.TqdmProgressMeter), "`progress_meter` must be a progress meter such as diffrax.TqdmProgressMeter(), but is the class TqdmProgressMeter"),
     "system a class": (given(system=D.ConstrainedSystem), "`system` must be a dae_jax.ConstrainedSystem, SemiExplicitDAE or ImplicitDAE, but is the class ConstrainedSystem."),

@@ -1,22 +1,19 @@
-"""Jaxprs with some of their equations, at any depth, replaced by others."""
+"""Jaxprs run with some of their equations, at any depth, replaced by what knows of those before it, and can end loops."""
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
-from jax.core import Tracer
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 from jaxtyping import Array
 
 from .._compat import scan_counts
 from ..types import Arrays, Equation, Params
 from .scalar_interpreter import Unsupported
-from .walk import CALLS, WITH_DERIVATIVE, called, equations, equations_in, identity, of_solve
+from .walk import CALLS, WITH_DERIVATIVE, called, equations, equations_in, of_solve
 
 
 _CALLS = {**CALLS, **WITH_DERIVATIVE}
-# Calls that stay calls.
-_STAY = frozenset({"jit", "pjit"})
 
 
 class Rewriting:
@@ -31,10 +28,9 @@ class Rewriting:
         self,
         applies: Callable[[Any], bool],
         replacement: Callable[[Any, list[Any], list[Any]], tuple[list[Any], list[Any]]],
-        stops: Callable[[Arrays], Array] | None = None,
+        stops: Callable[[Arrays], Array],
     ) -> None:
         self._applies, self._replacement, self._stops = applies, replacement, stops
-        self._known: dict[Hashable, tuple[ClosedJaxpr, ClosedJaxpr]] = {}
 
     def run(
         self, jaxpr: Jaxpr, consts: Sequence[Array], args: Sequence[Array], state: Arrays
@@ -51,16 +47,10 @@ class Rewriting:
         name, p = eqn.primitive.name, eqn.params
         if self._applies(eqn):
             return self._replacement(eqn, args, state)
-        if name == "cond" and not isinstance(args[0], Tracer):
-            branch = p["branches"][int(args[0])]
-            return self.run(branch.jaxpr, branch.consts, args[1:], state)
         if not any(map(self._applies, equations_in(eqn))):
             results = eqn.primitive.bind(*args, **eqn.primitive.get_bind_params(p))
             return results if eqn.primitive.multiple_results else [results], state
         inner = called(eqn, _CALLS)
-        if inner is not None and name in _STAY and not state:
-            found = eqn.primitive.bind(*args, **{**p, "jaxpr": self._called(inner)})
-            return found, state
         if inner is not None:
             return self.run(inner.jaxpr, inner.consts, args, state)
         match name:
@@ -77,14 +67,6 @@ class Rewriting:
                 return self.run(solve.jaxpr, solve.consts, of_solve(p, args), state)
         raise Unsupported(f"{name} with something in it that is to be replaced")
 
-    def _called(self, closed: ClosedJaxpr) -> ClosedJaxpr:
-        """A function that is called, rewritten once for all places."""
-        key = identity(closed)
-        if key not in self._known:
-            rewritten = jax.make_jaxpr(lambda *xs: self.run(closed.jaxpr, closed.consts, xs, [])[0])(*closed.in_avals)
-            self._known[key] = closed, rewritten
-        return self._known[key][1]
-
     def _joined(self, closed: ClosedJaxpr) -> Callable[..., list[Any]]:
         n = len(closed.jaxpr.invars)
         return lambda *xs: [y for ys in self.run(closed.jaxpr, closed.consts, xs[:n], list(xs[n:])) for y in ys]
@@ -92,13 +74,13 @@ class Rewriting:
     def _while(self, eqn: Equation, args: Arrays, state: Arrays) -> list[Any]:
         p, count = eqn.params, len(state)
         n, condition = p["cond_nconsts"], p["cond_jaxpr"]
-        changes = any(map(self._applies, equations(condition)))
-        if state and (changes or condition.out_avals[0].shape):
+        if any(map(self._applies, equations(condition))) or condition.out_avals[0].shape:
             raise Unsupported("a check in the condition of a loop, or in a loop with several conditions")
+        holds = jaxpr_as_fun(condition)
 
         def goes_on(*xs: Array) -> Any:
-            (found,), _ = self.run(condition.jaxpr, condition.consts, xs[: len(xs) - count], [])
-            return found & ~self._stops(list(xs[len(xs) - count :])) if self._stops and state else found
+            (found,) = holds(*xs[: len(xs) - count])
+            return found & ~self._stops(list(xs[len(xs) - count :]))
 
         structs = list(map(jax.typeof, [*args, *state]))
         m = n + p["body_nconsts"]

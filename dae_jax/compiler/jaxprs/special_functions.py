@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -115,18 +115,17 @@ SPECIAL: dict[str, Callable[..., Any]] = {
 }
 
 
-def by_simpler_ones(eqn: Equation) -> ClosedJaxpr:
-    """A jaxpr that computes what an equation does whose primitive is in the table."""
+def by_simpler_ones(eqn: Equation, table: Mapping[str, Callable[..., Any]] = SPECIAL) -> ClosedJaxpr:
+    """A jaxpr that computes what an equation does whose primitive is in a table, from its name to a function."""
     structs = tuple((v.aval.shape, v.aval.dtype) for v in eqn.invars)
-    found = _traced(eqn.primitive.name, structs, tuple(eqn.params.items()))
+    params = tuple(eqn.primitive.get_bind_params(eqn.params).items())
+    found = _traced(table[eqn.primitive.name], structs, params)
     assert [(a.shape, a.dtype) for a in found.out_avals] == [(v.aval.shape, v.aval.dtype) for v in eqn.outvars]
     return found
 
 
-@functools.lru_cache(maxsize=64)
+@functools.lru_cache(maxsize=256)
 def _traced(
-    name: str, structs: tuple[tuple[tuple[int, ...], DType], ...], params: tuple[tuple[str, Hashable], ...]
+    fn: Callable[..., Any], structs: tuple[tuple[tuple[int, ...], DType], ...], params: tuple[tuple[str, Hashable], ...]
 ) -> ClosedJaxpr:
-    return jax.make_jaxpr(functools.partial(SPECIAL[name], **dict(params)))(
-        *(jax.ShapeDtypeStruct(*s) for s in structs)
-    )
+    return jax.make_jaxpr(functools.partial(fn, **dict(params)))(*(jax.ShapeDtypeStruct(*s) for s in structs))

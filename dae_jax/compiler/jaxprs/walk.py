@@ -34,7 +34,7 @@ WITH_DERIVATIVE = {"custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jax
 ALL_CALLS = {**CALLS, **WITH_DERIVATIVE, "custom_vmap_call": "call"}
 
 # Parameters that hold no jaxpr; most are of the first, which are told at a glance.
-_PLAIN = frozenset({int, bool, float, str, type(None)})
+PLAIN = frozenset({int, bool, float, str, type(None)})
 _PLAIN_KINDS = int | float | str | np.dtype | np.generic | enum.Enum | None
 
 
@@ -76,7 +76,7 @@ def equations_in(eqn: Equation) -> list[Any]:
 def held_by(eqn: Equation) -> Iterator[ClosedJaxpr | Jaxpr]:
     """The jaxprs that an equation holds."""
     for param in eqn.params.values():
-        if type(param) not in _PLAIN:
+        if type(param) not in PLAIN:
             yield from jaxprs_in(param)
 
 
@@ -91,7 +91,7 @@ def jaxprs_in(param: object) -> Iterator[ClosedJaxpr | Jaxpr]:
         yield param
     elif isinstance(param, tuple | list):
         for x in param:
-            if type(x) not in _PLAIN:
+            if type(x) not in PLAIN:
                 yield from jaxprs_in(x)
     elif not isinstance(param, _PLAIN_KINDS):
         is_jaxpr = lambda x: isinstance(x, ClosedJaxpr | Jaxpr)

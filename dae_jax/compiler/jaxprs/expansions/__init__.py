@@ -4,20 +4,20 @@ A function gets the operands and the parameters of the equation, and gives the r
 them. It raises `Unsupported` for what it does not take.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import eval_jaxpr
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array
 
-from ...types import Arrays, DType, Equation
-from ..rewriting import Rewriting
+from ...types import DType, Equation
+from ..special_functions import by_simpler_ones
+from ..substitution import Substitution
 from ..unchecked import checks_dropped
-from ..walk import equations
 from .factorisations import cholesky, lu, lu_pivots_to_permutation
 from .orthogonal import geqrf, householder_product, qr
 from .sorting import sort
@@ -48,7 +48,6 @@ EXPANSIONS: dict[str, Callable[..., Any]] = {
     "lu_pivots_to_permutation": lu_pivots_to_permutation,
     # equinox's mark of what is not to be transformed any more; what is written out may be.
     "nontraceable": lambda x, **_: x,
-    "one_kernel": kernel_written_out,
     "platform_index": _platform_index,
     "qr": qr,
     "sort": sort,
@@ -62,25 +61,17 @@ def expanded(closed: ClosedJaxpr, checks: bool = True) -> ClosedJaxpr:
     """The same function without the primitives of the table, at any depth; without `checks`, those that come to light are left
     out: what is singular then gives what is not finite.
     """
-    if not any(map(_is_expanded, equations(closed))):
-        return closed
 
-    def fn(*args: Array) -> list[Any]:
-        return rewriting.run(closed.jaxpr, closed.consts, args, [])[0]
+    def simpler(eqn: Equation) -> ClosedJaxpr | None:
+        name = eqn.primitive.name
+        if name in EXPANSIONS:
+            return by_simpler_ones(eqn, EXPANSIONS)
+        if name == "one_kernel" and not eqn.params["lanes"]:
+            return eqn.params["jaxpr"]
+        if name != "one_kernel" and name not in _EVALUATED:
+            return None
+        fn = functools.partial(kernel_written_out if name == "one_kernel" else eqn.primitive.impl, **eqn.params)
+        inner = jax.make_jaxpr(fn)(*(v.aval for v in eqn.invars))
+        return inner if checks else checks_dropped(inner)
 
-    rewriting = Rewriting(_is_expanded, lambda eqn, args, state: (_results(eqn, args, checks), state))
-    return jax.make_jaxpr(fn)(*closed.in_avals)
-
-
-def _is_expanded(eqn: Equation) -> bool:
-    return eqn.primitive.name in EXPANSIONS or eqn.primitive.name in _EVALUATED
-
-
-def _results(eqn: Equation, args: Arrays, checks: bool) -> list[Any]:
-    name, params = eqn.primitive.name, eqn.primitive.get_bind_params(eqn.params)
-    if name in EXPANSIONS:
-        out = EXPANSIONS[name](*args, **params)
-        return list(out) if eqn.primitive.multiple_results else [out]
-    inner = jax.make_jaxpr(lambda *xs: eqn.primitive.impl(*xs, **params))(*args)
-    inner = expanded(inner if checks else checks_dropped(inner), checks)
-    return eval_jaxpr(inner.jaxpr, inner.consts, *args)
+    return Substitution(simpler)(closed)
