@@ -234,18 +234,23 @@ def precision_of(dtype: DType, controller: diffrax.AbstractStepSizeController) -
     return ", ".join([str(np.dtype(dtype)), *said])
 
 
+@jax.jit
 def _last(ts: Float[Array, "*batch times"], ys: State) -> Any:
     if ts.ndim > 1:
         return jax.vmap(_last)(ts, ys)
-    return jax.tree.map(lambda y: y[-1], without_padding(ts, ys)[1])
+    last = _last_saved(ts)
+    return jax.tree.map(lambda y: y[last], ys)
+
+
+def _last_saved(ts: Float[Array, " times"]) -> Any:
+    return jnp.maximum(jnp.sum(jnp.isfinite(ts)) - 1, 0)
 
 
 def without_padding(ts: Float[Array, "*batch times"], ys: State) -> tuple[Any, Any]:
     """Saved times and states with padding, times that are infinite, overwritten by the last ones that were saved: every
     function of them then has its value there, and its largest and smallest are those over the saved times.
     """
-    last = jnp.maximum(jnp.sum(jnp.isfinite(ts)) - 1, 0)
-    at = jnp.minimum(jnp.arange(ts.shape[0]), last)
+    at = jnp.minimum(jnp.arange(ts.shape[0]), _last_saved(ts))
     return ts[at], jax.tree.map(lambda y: y[at], ys)
 
 

@@ -66,7 +66,8 @@ def is_crowded(system: System, t: Time, state: State, args: Args) -> bool:
     assert is_mechanism(system)
     q, v = state
     g, h = system.constraint, system.nonholonomic
-    found = jax.eval_shape(lambda: (g and g(t, q, args), h and h(t, q, v, args)))
+    # Of arguments: of numbers that are known it would be computed, operation by operation.
+    found = eqx.filter_eval_shape(lambda t, q, v, args: (g and g(t, q, args), h and h(t, q, v, args)), t, q, v, args)
     return sum(x.size for x in jax.tree.leaves(found)) >= sum(jnp.size(x) for x in jax.tree.leaves(q))
 
 
