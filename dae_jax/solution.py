@@ -140,7 +140,7 @@ class DAESolution(eqx.Module):
       in the accepted ones; `stats["end_time"]`: the time at which the solve ended; of a solve outside `jit`, `vmap` and
       `grad` also "compile_seconds", the time that it took to trace and compile it and to run it for the first time, 0 where it
       was compiled already; `stats["doubts"]`: 0, or what an `AccuracyWarning` says, as the sum of 1 (drifted), 2 (fixed steps too
-      large), 4 (very many steps) and 8 (a singular configuration was passed).
+      large), 4 (very many steps), 8 (a singular configuration was passed) and 16 (a pulse in time may have been stepped over).
     - `result`: a `RESULTS` code, with its message.
     - `event_mask`: which event ended the solve, if any.
     - `args`: as given; `changed`: what the resets of a `Reset` have changed of them, in their structure, as it holds at each saved time

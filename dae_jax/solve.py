@@ -98,8 +98,9 @@ def daesolve(
     Errors: `ValueError` or `TypeError` in a sentence for wrong input that is concrete; `RuntimeError` where the solve
     fails, or a `RESULTS` code with `throw=False`. An `AccuracyWarning` where it does not fail, but the answer is doubtful: it has
     drifted off the constraints by more than a thousand tolerances, fixed steps are too large for the motion, a million steps may
-    add up their errors, or it has passed a configuration in which the constraints depend on each other (seen with up to 32 of
-    them) or a mass is negative; in a batch or under `jit` `stats["doubts"]` says so, by bits 1, 2, 4 and 8.
+    add up their errors, it has passed a configuration in which the constraints depend on each other (seen with up to 32 of
+    them) or a mass is negative, or the equations switch with time more than once in a step, where a pulse may be stepped over; in a
+    batch or under `jit` `stats["doubts"]` says so, by bits 1, 2, 4, 8 and 16.
     """
     solve, problem = prepared(
         with_rates(system, yd0, y0), solver, t0, t1, dt0, y0, args, formulation, saveat, stepsize_controller, adjoint, event,

@@ -35,6 +35,7 @@ from .passages import passages
 from .problem import Problem
 from .start import is_saved_part
 from .summed_errors import SummedErrors
+from .switches import stepped_over
 from .traced_once import TracedOnce
 from .trajectory_adjoint import as_it_is, can_be_taped
 
@@ -108,6 +109,9 @@ def call(solve: "Solve", problem: Problem, steps: Float[Array, " steps"] | None 
     passage = passages(problem, ode, solve.formulation.decode, not solve.keeps()[0], solve.formulation.inverts_mass)
     if passage is not None:
         observers["passage"] = passage
+    switches = stepped_over(problem) if steps is None and not solve.recording else None
+    if switches is not None:
+        observers["switches"] = switches
     controller = observed(controller if steps is None else at_steps(controller, steps), observers)
     saveat = dataclasses.replace(saveat, controller_state=True) if observers else saveat
     sol = diffrax.diffeqsolve(
@@ -132,7 +136,7 @@ def call(solve: "Solve", problem: Problem, steps: Float[Array, " steps"] | None 
     if "passage" in found:
         passed, determined, _ = found["passage"]
         result = RESULTS.where((result == RESULTS.successful) & ~jnp.asarray(determined), RESULTS.undetermined, result)
-    seen = found["errors"].total if "errors" in found else None, passed
+    seen = found["errors"].total if "errors" in found else None, passed, found.get("switches", False)
     times = taken(found["ends"]) if "ends" in found else steps
     return sol.t0, sol.t1, ts["user"], ys["user"], interpolation, stats, result, sol.event_mask, seen, end, times
 

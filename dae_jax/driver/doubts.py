@@ -27,6 +27,7 @@ class Doubt(enum.IntFlag):
     UNRESOLVED = 2
     MANY_STEPS = 4
     PASSED = 8
+    STEPPED_OVER = 16
 
 
 _SENTENCES = {
@@ -50,21 +51,37 @@ _SENTENCES = {
         "angle are taken for such a passage too.) Look whether it goes on as is meant; a method that keeps the constraints and smaller "
         "tolerances or steps tell what comes near one from what passes it."
     ),
+    Doubt.STEPPED_OVER: (
+        "In a step the equations switch more than once with time (as `t % period < width` does): a pulse between the points at which "
+        "a method evaluates them is stepped over, and leaves no trace in the estimate of the error. Make the times known at which they "
+        "switch, `diffrax.ClipStepSizeController(controller, jump_ts=times)`, or take steps shorter than a pulse (`dtmax`, `dt0`)."
+    ),
 }
 
 
 def found(
-    solve: "Solve", drifted: BoolScalar, steps: IntScalar, errors: Scalar | None, passed: BoolLike
+    solve: "Solve",
+    drifted: BoolScalar,
+    steps: IntScalar,
+    errors: Scalar | None,
+    passed: BoolLike,
+    stepped_over: BoolLike,
 ) -> Int[Array, ""]:
     """The doubts about a solve that went well, as bits; `errors`: of all fixed steps, as parts of the solution; `passed`:
-    a configuration in which the constraints depend on each other.
+    a configuration in which the constraints depend on each other; `stepped_over`: what switched in a step, with time, and back.
     """
     many = jnp.asarray(False)
     if isinstance(solve.controller, diffrax.AbstractAdaptiveStepSizeController):
         rtol = jnp.max(jnp.asarray(getattr(solve.controller, "rtol")))  # noqa: B009
         many = (steps >= MANY) & (steps * rtol > PART)
     unresolved = jnp.asarray(False) if errors is None else errors > 1
-    bits = {Doubt.DRIFTED: drifted, Doubt.UNRESOLVED: unresolved, Doubt.MANY_STEPS: many, Doubt.PASSED: passed}
+    bits = {
+        Doubt.DRIFTED: drifted,
+        Doubt.UNRESOLVED: unresolved,
+        Doubt.MANY_STEPS: many,
+        Doubt.PASSED: passed,
+        Doubt.STEPPED_OVER: stepped_over,
+    }
     return sum((jnp.where(on, int(bit), 0) for bit, on in bits.items()), jnp.zeros((), int))
 
 

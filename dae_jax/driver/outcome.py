@@ -27,7 +27,7 @@ def judged(
     """The solution, with the code of what is wrong with it; `found`: what a look at its start and its end has shown, `ended`: where
     that is.
     """
-    t0, t1, ts, ys, interpolation, stats, code, event_mask, (errors, passed) = out
+    t0, t1, ts, ys, interpolation, stats, code, event_mask, seen = out
     (start, _), end, (finite_end, defined) = found
     failed = lambda name, instead, when=True: RESULTS.where((code == name) & when, instead, code)
     if takes_residuals(solve.solver):
@@ -68,9 +68,7 @@ def judged(
     went_well = (code == RESULTS.successful) | (code == RESULTS.event_occurred)
     stats = {
         **stats,
-        "doubts": jnp.where(
-            went_well, doubts.found(solve, end.drifted, stats["num_accepted_steps"], errors, passed), 0
-        ),
+        "doubts": jnp.where(went_well, doubts.found(solve, end.drifted, stats["num_accepted_steps"], *seen), 0),
     }
     return DAESolution(t0, t1, ts, ys, interpolation, stats, code, event_mask, problem.args, rank, precision, end=ended)
 
