@@ -89,9 +89,10 @@ def daesolve(
     - `saveat`, `adjoint`, `event`, `max_steps`, `throw`, `progress_meter`: as in diffrax. Functions in `saveat` and
       `event` get the state in the structure of `y0`, and the user's `args`. With a `Reset` as `event` the solve goes on
       after it. Derivatives are those of the numerical solution: where steps leap over a kink of a function (`abs`, `where`, `sort`)
-      they are right to about the square root of the tolerance; make its time known (`jump_ts`), or a `Reset` of it. Second derivatives
-      are there in any order of modes, third ones with `jax.jacfwd` outside; with a
-      progress meter or without one kernel forward-mode derivatives need `adjoint=diffrax.ForwardMode()`.
+      they are right to about the square root of the tolerance; make its time known (`jump_ts`), or a `Reset` of it. Where it jumps
+      at a time that depends on what is differentiated, they lack that dependence, as the derivative of `where` does: a `Reset` has
+      it. Second derivatives are there in any order of modes, third ones with `jax.jacfwd` outside; with a progress meter or without
+      one kernel forward-mode derivatives need `adjoint=diffrax.ForwardMode()`.
 
     **Returns** a `DAESolution`.
 

@@ -124,3 +124,23 @@ def test_is_looked_for_only_where_equations_switch_with_time():
     seen = stepped_over(problem(pulses))
     assert seen is not None
     assert all(eqn.primitive.name in ("rem", "lt", "ne", "and", "select_n", "add") for eqn in seen.comparisons.eqns)
+
+
+def test_a_reset_has_the_derivative_by_a_switching_time():
+    """The force ends at t = τ: v(2) = 2τ. By `where` the derivative lacks it, as that of `where` itself does."""
+
+    def speed(tau, event, force):
+        system = dae_jax.ConstrainedSystem(force, lambda t, q, args: q[1])
+        args = {"tau": tau, "force": jnp.array([2.0, 0.0])}
+        return dae_jax.daesolve(
+            system, METHODS["projection"][0], 0.0, 2.0, None, START, args, event=event
+        ).final[1][0]  # fmt: skip
+
+    off = dae_jax.Reset(
+        lambda t, y, args, **kwargs: t - args["tau"], lambda t, y, args: (y, {**args, "force": 0 * args["force"]})
+    )
+    with_reset = lambda tau: speed(tau, off, lambda t, q, v, args: args["force"])
+    by_where = lambda tau: speed(tau, None, lambda t, q, v, args: jnp.where(t < args["tau"], args["force"], 0.0))
+    for derivative in (jax.grad, jax.jacfwd):
+        np.testing.assert_allclose(derivative(with_reset)(0.7), 2.0, rtol=1e-9)
+        assert derivative(by_where)(0.7) == 0
