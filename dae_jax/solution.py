@@ -53,8 +53,9 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
     off_constraints = (
         "The solution does not satisfy the constraints at its end: it has drifted off by as much as its own size, "
-        "constraints that were redundant contradict each other, or one has become singular. Use a method that keeps the "
-        "constraints, such as OrthogonalProjection, and smaller steps or tolerances; `dae_jax.drift` shows where."
+        "the chart of `StateSpace` leaves them, constraints that were redundant contradict each other, or one has become singular. "
+        "Use a method that keeps the constraints, such as OrthogonalProjection, and smaller steps or tolerances; `dae_jax.drift` "
+        "shows where."
     )
     no_finite_start = (
         "The start does not determine all unknowns: the gradient of a constraint vanishes there (write the constraint itself, not "

@@ -185,6 +185,7 @@ METHODS = {
     "chart of None": (lambda: D.StateSpace(None), "`chart` of StateSpace must be a function from coordinates z to q, but is None."),
     "guess in words": (lambda: D.StateSpace(lambda z: z, guess="x"), "`guess` of StateSpace must be a vector of coordinates, but is 'x'."),
     "chart off the constraint": (by(lambda: D.StateSpace(lambda z: jnp.stack([2 * jnp.sin(z[0]), jnp.cos(z[0])]))), "the chart of `StateSpace` does not give the initial positions (it must satisfy the constraints for every z"),
+    "chart that leaves the constraint": (by(lambda: D.StateSpace(lambda z: jnp.stack([jnp.cos(z[0]) + 0.3 * z[0], jnp.sin(z[0])]))), "the chart of `StateSpace` leaves them"),
     "controller a class": (steps(diffrax.PIDController), "`stepsize_controller` must be a step-size controller such as diffrax.PIDController(rtol=1e-6, atol=1e-6), but is the class PIDController: write PIDController(...)."),
     "controller a tolerance": (steps(1e-6), "`stepsize_controller` must be a step-size controller such as diffrax.PIDController(rtol=1e-6, atol=1e-6), but is 1e-06."),
     "tolerance negative": (steps(diffrax.PIDController(-1e-6, 1e-6)), "`stepsize_controller` must have positive tolerances, but has rtol = -1e-06 and atol = 1e-06"),
