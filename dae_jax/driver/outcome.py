@@ -21,6 +21,12 @@ if TYPE_CHECKING:
     from .program import Solve
 
 
+# How solves end at a singular configuration, of which they know nothing.
+_STUCK = (
+    "step_rejected", "off_manifold", "no_convergence", "error_too_large", "singular_iteration_matrix", "max_steps_reached",
+)  # fmt: skip
+
+
 def judged(
     solve: "Solve", out: Sequence[PyTree], problem: Problem, found: tuple[PyTree, ...], ended: tuple[Scalar, State]
 ) -> DAESolution:
@@ -52,8 +58,8 @@ def judged(
         code = failed(RESULTS.nonlinear_max_steps_reached, RESULTS.event_not_located)
     went_well = (code == RESULTS.successful) | (code == RESULTS.event_occurred)
     code = RESULTS.where(went_well & ~defined, RESULTS.undefined_condition, code)
-    stuck = [RESULTS.step_rejected, RESULTS.off_manifold, RESULTS.no_convergence, RESULTS.error_too_large]
-    stuck = jnp.any(jnp.stack([code == name for name in (*stuck, RESULTS.singular_iteration_matrix)]))
+    stuck = [getattr(RESULTS, name) for name in _STUCK]
+    stuck = jnp.any(jnp.stack([code == name for name in stuck]))
     code = RESULTS.where(stuck & end.singular, RESULTS.singular_configuration, code)
     code = RESULTS.where(went_well & ~end.near, RESULTS.off_constraints, code)
     code = RESULTS.where(

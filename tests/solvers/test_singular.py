@@ -220,6 +220,19 @@ def driven_linkage():
     return system, dae_jax.consistent_state(system, 0.0, guess)
 
 
+def crank_of_equal_lengths():
+    """A slider-crank whose crank and rod are as long, on its way to where the slider is above the pivot."""
+
+    def constraint(t, q, args):
+        return jnp.stack([circle(q[:2]), ((q[2] - q[0]) ** 2 + q[1] ** 2 - 1) / 2])
+
+    system = ConstrainedSystem(
+        lambda t, q, v, args: jnp.array([0.0, -9.81, 0.0]), constraint, potential=lambda q, args: 9.81 * q[1]
+    )
+    c, s = np.cos(0.5), np.sin(0.5)
+    return system, (jnp.array([c, s, 2 * c]), jnp.array([-s, c, -2 * s]))
+
+
 class TestSingularConfiguration:
     @pytest.mark.parametrize(
         ("solver", "formulation"),
@@ -251,18 +264,19 @@ class TestSingularConfiguration:
         # η/(√(sin² θ + η) − sin θ) in place of s = sin θ + √(sin² θ + η), which has no digits left here.
         np.testing.assert_allclose(slider, excess / (np.hypot(np.sin(angle), excess**0.5) - np.sin(angle)), atol=1e-12)
 
-    def test_a_slider_crank_of_equal_lengths_passes_its_dead_centre(self):
-        def constraint(t, q, args):
-            return jnp.stack([circle(q[:2]), ((q[2] - q[0]) ** 2 + q[1] ** 2 - 1) / 2])
-
-        system = ConstrainedSystem(
-            lambda t, q, v, args: jnp.array([0.0, -9.81, 0.0]), constraint, potential=lambda q, args: 9.81 * q[1]
-        )
-        c, s = np.cos(0.5), np.sin(0.5)
-        y0 = (jnp.array([c, s, 2 * c]), jnp.array([-s, c, -2 * s]))
-        saveat = diffrax.SaveAt(t0=True, t1=True)
+    @pytest.mark.parametrize("solver", [dae_jax.TangentSpace(diffrax.Dopri8()), dae_jax.RadauIIA5()], ids=str)
+    def test_a_slider_crank_of_equal_lengths_passes_its_dead_centre(self, solver):
+        system, y0 = crank_of_equal_lengths()
         with pytest.warns(dae_jax.AccuracyWarning, match="dead centre"):
-            sol = solve(system, dae_jax.TangentSpace(diffrax.Dopri8()), y0, t1=3.0, saveat=saveat)
+            sol = solve(system, solver, y0, t1=3.0, saveat=diffrax.SaveAt(t0=True, t1=True))
         energy = dae_jax.energy(system, sol)
         assert abs(energy[1] - energy[0]) < 1e-5
         np.testing.assert_allclose(sol.ys[0][1, 2], 2 * sol.ys[0][1, 0], atol=1e-6)
+
+    def test_that_it_ends_at_its_dead_centre_is_said_also_where_the_steps_run_out(self):
+        system, y0 = crank_of_equal_lengths()
+        sol = solve(
+            system, diffrax.Tsit5(), y0, t1=3.0, formulation=dae_jax.DummyDerivatives(), max_steps=500, throw=False
+        )
+        assert sol.result == RESULTS.singular_configuration
+        np.testing.assert_allclose(sol.end[1][0][0], 0.0, atol=1e-4)
