@@ -1,4 +1,4 @@
-"""What to keep of a solve in a sweep: numbers, so that memory does not grow with the steps."""
+"""What to keep of a solve in a sweep: numbers, so that memory does not grow with the steps; of a batch within `vmap`."""
 
 from typing import Any
 
@@ -34,6 +34,7 @@ def energy_error(system: ConstrainedSystem, sol: DAESolution) -> Float[Array, ""
 
 def largest_error(sol: DAESolution, reference: State) -> Float[Array, ""]:
     """max |y − reference| over the saved times, infinite where the solve failed; `reference` has the structure of `sol.ys`."""
+    _refuse_batch(sol)
 
     def largest(y: State, r: State) -> Any:
         saved = jnp.isfinite(sol.ts).reshape(-1, *(1,) * (y.ndim - 1))
@@ -96,8 +97,15 @@ def lyapunov(
 
 
 def _where_it_went_well(sol: DAESolution, value: Float[Array, ""], otherwise: float) -> Float[Array, ""]:
+    _refuse_batch(sol)
     went_well = (sol.result == RESULTS.successful) | (sol.result == RESULTS.event_occurred)
     return jnp.where(went_well, value, otherwise)
+
+
+def _refuse_batch(sol: DAESolution) -> None:
+    """Lanes have a number each, which `vmap` gives."""
+    if jnp.ndim(sol.t0):
+        raise ValueError("This is a number of one solution, and the one given is a batch: call it within `jax.vmap`.")
 
 
 def _norm(tree: PyTree) -> Float[Array, ""]:

@@ -240,6 +240,7 @@ AROUND = {
     "drift of states": (lambda: D.drift(PENDULUM, (Q0, V0)), "`sol` must be what `daesolve` returns, but is (Array("),
     "drift of a function": (lambda: D.drift(PENDULUM, solved(saveat=diffrax.SaveAt(t1=True, fn=lambda t, y, a: y[0]))), "`sol.ys` must hold states of `system`: leave out `SaveAt(fn=...)`"),
     "drift of dense output": (lambda: D.drift(PENDULUM, solved(saveat=diffrax.SaveAt(dense=True))), "`sol` must have saved states: `SaveAt(t1=True)` or `SaveAt(ts=...)`"),
+    "largest drift of a batch": (lambda: D.reductions.largest_drift(PENDULUM, jax.vmap(lambda a: solve(y0=(Q0, a * V0)))(jnp.ones(2))), "and the one given is a batch: call it within `jax.vmap`."),
     "final of dense output": (lambda: solved(saveat=diffrax.SaveAt(dense=True)).final, "The solution has no saved states; pass `saveat=diffrax.SaveAt(t1=True)`."),
     "multipliers of an ImplicitDAE": (lambda: D.multipliers(DECAY, solved()), "`multipliers` takes a ConstrainedSystem; those of this ImplicitDAE are among its unknowns, in `sol.ys`."),
     "multipliers of y": (lambda: D.multipliers(PENDULUM, 0.0, (Q0, V0)), "`multipliers` takes (system, sol) or (system, t, q, v, args)."),
