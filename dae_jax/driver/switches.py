@@ -11,6 +11,7 @@ from jax.core import eval_jaxpr
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
 
 from ..compiler.jaxprs.inline import Inlining
+from ..compiler.jaxprs.walk import needed_for
 from ..compiler.types import Atom
 from ..equations.manifold_ode import Equations
 from ..types import BoolScalar, Time, Y
@@ -58,14 +59,10 @@ def stepped_over(problem: Problem) -> SteppedOver | None:
     every, found = _comparisons(flat)
     if not found:
         return None
-    needed, eqns = set(found), []
-    for eqn in reversed(every):
-        if not needed.isdisjoint(eqn.outvars):
-            eqns.append(eqn)
-            needed.update(v for v in eqn.invars if isinstance(v, Var))
+    eqns, needed = needed_for(found, [eqn for eqn in every if not eqn.effects])
     constants = [(v, x) for v, x in zip(flat.jaxpr.constvars, flat.consts, strict=True) if v in needed]
     comparisons = flat.jaxpr.replace(
-        constvars=[v for v, _ in constants], invars=flat.jaxpr.invars[:1], outvars=found, eqns=eqns[::-1]
+        constvars=[v for v, _ in constants], invars=flat.jaxpr.invars[:1], outvars=found, eqns=eqns
     )
     return SteppedOver(comparisons, [jnp.asarray(x) for _, x in constants])
 

@@ -12,7 +12,7 @@ from jaxtyping import Array
 from ..types import Atom, Aval, Equation, Params, aval_of
 from .few_turns import written_out
 from .special_functions import SPECIAL, by_simpler_ones
-from .walk import called, identity, of_solve
+from .walk import called, identity, needed_for, of_solve
 
 
 # They give their first operand, or what is said here; others of equinox mean something to transformations only.
@@ -54,13 +54,9 @@ def _flat(closed: ClosedJaxpr, inlined: Inlining) -> ClosedJaxpr:
     flat = _Flat(inlined)
     inputs = [Var(v.aval) for v in closed.jaxpr.invars]
     outputs = flat.run(closed, inputs)
-    needed, eqns = {v for v in outputs if isinstance(v, Var)}, []
-    for eqn in reversed(flat.eqns):
-        if eqn.effects or not needed.isdisjoint(eqn.outvars):
-            eqns.append(eqn)
-            needed.update(v for v in eqn.invars if isinstance(v, Var))
+    eqns, needed = needed_for(outputs, flat.eqns)
     constants = [(v, x) for v, x in flat.constants.values() if v in needed]
-    jaxpr = closed.jaxpr.replace(constvars=[v for v, _ in constants], invars=inputs, outvars=outputs, eqns=eqns[::-1])
+    jaxpr = closed.jaxpr.replace(constvars=[v for v, _ in constants], invars=inputs, outvars=outputs, eqns=eqns)
     return ClosedJaxpr(jaxpr, [x for _, x in constants])
 
 

@@ -39,7 +39,7 @@ class Substitution:
             args = list(map(read, eqn.invars))
             inner = self._in_place_of(eqn, args)
             if inner is None:
-                found.append(self._kept(eqn, args))
+                found.eqns.append(self._kept(eqn, args))
             else:
                 env.update(zip(eqn.outvars, found.splice(inner, args), strict=True))
         if not env and all(a is b for a, b in zip(found.eqns, closed.jaxpr.eqns, strict=True)):
@@ -86,9 +86,6 @@ class _Equations:
         self.eqns: list[JaxprEqn] = []
         self.constants: list[tuple[Var, Any]] = []
 
-    def append(self, eqn: JaxprEqn) -> None:
-        self.eqns.append(eqn)
-
     def splice(self, inner: ClosedJaxpr, args: Sequence[Atom]) -> list[Any]:
         """Writes down the equations of a jaxpr of the last operands; gives its results."""
         fresh = [(Var(v.aval), x) for v, x in zip(inner.jaxpr.constvars, inner.consts, strict=True)]
@@ -98,7 +95,7 @@ class _Equations:
         read = lambda v: v if isinstance(v, Literal) else env[v]
         for eqn in inner.jaxpr.eqns:
             outs = [Var(v.aval) for v in eqn.outvars]
-            self.append(eqn.replace(invars=list(map(read, eqn.invars)), outvars=outs))
+            self.eqns.append(eqn.replace(invars=list(map(read, eqn.invars)), outvars=outs))
             env.update(zip(eqn.outvars, outs, strict=True))
         return list(map(read, inner.jaxpr.outvars))
 

@@ -2,12 +2,12 @@
 
 import enum
 import weakref
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import jax
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr
+from jax.extend.core import ClosedJaxpr, Jaxpr, Var
 from jaxtyping import PyTree
 
 from ..types import Equation, Params
@@ -109,6 +109,16 @@ def called(eqn: Equation, calls: Mapping[str, str] = ALL_CALLS) -> ClosedJaxpr |
 def identity(closed: ClosedJaxpr) -> Hashable:
     """What is the same of two calls of one function."""
     return id(closed.jaxpr), *map(id, closed.consts)
+
+
+def needed_for(outputs: Iterable[Any], eqns: Sequence[Any]) -> tuple[list[Any], set[Any]]:
+    """Those of the equations that outputs, or effects, need, and all variables that are needed."""
+    needed, kept = {v for v in outputs if isinstance(v, Var)}, []
+    for eqn in reversed(eqns):
+        if eqn.effects or not needed.isdisjoint(eqn.outvars):
+            kept.append(eqn)
+            needed.update(v for v in eqn.invars if isinstance(v, Var))
+    return kept[::-1], needed
 
 
 def of_solve(p: Params, args: list[T]) -> list[T]:
