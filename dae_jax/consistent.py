@@ -10,12 +10,13 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, PyTree
 
 from .compiler import at_ease
-from .equations.constraint_jacobian import dense_mass, mass_solve
+from .equations.constraint_jacobian import dense_mass, mass_solve, of_rows
 from .equations.initial_rates import is_nonlinear, rates_of
 from .equations.linearised import LinearisedResidual
 from .equations.mechanical import MechanicalODE
+from .equations.nearest_point import nearest_point
 from .equations.regularity import mass_is_regular, mass_message
-from .equations.residual_form import ResidualForm
+from .equations.residual_form import ResidualForm, weighted
 from .equations.structural_ode import StructuralODE
 from .linalg import fixed_point, implicit_root, relative_change
 from .systems import ConstrainedSystem, System, is_mechanism
@@ -191,46 +192,71 @@ def _nearest_of_any(system: System, t: Time, y0: State, args: Args, masks: State
     t = jnp.asarray(t, values.dtype)
     ode = StructuralODE.of(form, values.dtype, complete=True)
     freedom = jnp.where(form.encode(masks), 0, 1)
-    y = ode.start(t, values, freedom, None if rates is None else form.encode(rates))
+    near = rates_of(form, t, values)[0] if rates is None and is_nonlinear(form, values.dtype) else None
+    y = ode.start(t, values, freedom, None if rates is None else form.encode(rates), near)
     remains = _left_over(ode, t, y)
     fine = remains.consistent()
     return jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), ode.decode(t, y)), fine, remains
 
 
 @eqx.filter_jit
-def _nearest(ode: MechanicalODE, t: Time, y: Phase, weights: Phase) -> Any:
-    params = (ode, t, y, weights)
-
+def _nearest(ode: MechanicalODE, t: Time, y: Phase, free: Phase) -> Any:
     def iterate(params: PyTree) -> Any:
+        ode, _, (q0, v0), (of_q, _) = params
+        start = jnp.concatenate([q0, v0])
+        mass = _of_free(dense_mass(ode.mass(q0)), of_q)
+        near = nearest_point(
+            lambda x, aim: _improved(x, aim, params),
+            start,
+            lambda x: start,
+            lambda a, b: jnp.sum(a[: q0.size] * weighted(mass, b[: q0.size])),
+            jnp.concatenate([of_q > 0, jnp.zeros_like(of_q, bool)]),
+        )
+
         def correct(x: Float[Array, " 2n"]) -> Any:
-            new = _improved(x, params)
+            new = _improved(x, x, params)
             return new, relative_change(new - x, x)
 
-        return fixed_point(correct, jnp.concatenate(params[2]), max_steps=100)
+        # What is left of the constraints at the nearest point.
+        return fixed_point(correct, near, max_steps=100)
 
-    x, _ = implicit_root(lambda x, p: x - _improved(x, p), iterate, params)
+    off = lambda x, params: x - _improved(x, jnp.concatenate(params[2]), params)
+    x, _ = implicit_root(off, iterate, (ode, t, y, free))
     q, v = jnp.split(x, 2)
     remains, regular = violation(ode, t, (q, v)), mass_is_regular(ode, y[0], True)
     found = remains.consistent() & regular
     return jax.tree.map(lambda z: jnp.where(found, z, jnp.nan), (q, v)), found, remains, regular
 
 
-def _improved(x: Float[Array, " 2n"], params: PyTree) -> Float[Array, " 2n"]:
-    """A Gauss–Newton step towards the constrained minimum of the distance to the given state."""
-    ode, t, (q0, v0), (wq, wv) = params
+def _improved(x: Float[Array, " 2n"], aim: Float[Array, " 2n"], params: PyTree) -> Float[Array, " 2n"]:
+    """The q next to that of `aim` on the linearisation of the constraints at x, and there the v next to the given one."""
+    ode, t, (q0, v0), (of_q, of_v) = params
     q, v = jnp.split(x, 2)
     m = ode.holonomic
-    a = ode.constraint_jacobian(t, q, v)
-    metric = lambda w, rows: w[:, None] * mass_solve(ode.mass(q0), (rows * w).T)
+    a, mass = ode.constraint_jacobian(t, q, v), ode.mass(q0)
     g, _ = ode.invariants(t, (q, v))
     if m:
-        q = q0 - _least_norm(a[:m], metric(wq, a[:m]), g + jnp.dot(a[:m], q0 - q))
+        towards = aim[: q.size]
+        q = towards - _least_norm(a[:m], mass, of_q, g + jnp.dot(a[:m], towards - q))
     _, h = ode.invariants(t, (q, v))
-    v = v0 - _least_norm(a, metric(wv, a), h + jnp.dot(a, v0 - v))
+    v = v0 - _least_norm(a, mass, of_v, h + jnp.dot(a, v0 - v))
     return jnp.concatenate([q, v])
 
 
-def _least_norm(a: Float[Array, "c n"], n: Float[Array, "n c"], b: Float[Array, " c"]) -> Float[Array, " n"]:
+def _least_norm(
+    a: Float[Array, "c n"], mass: Float[Array, "..."] | None, free: Float[Array, " n"], b: Float[Array, " c"]
+) -> Float[Array, " n"]:
+    """The shortest x with A x = b in the metric of the mass matrix, where entries that are not `free` stay 0."""
+    n = mass_solve(_of_free(mass, free), (a * free).T)
     schur = jnp.dot(a, n)
     cut = float(jnp.finfo(schur.dtype).eps) ** 0.5
     return jnp.dot(n, jnp.dot(jnp.linalg.pinv(schur, rtol=cut, hermitian=True), b))
+
+
+def _of_free(mass: Float[Array, "..."] | None, free: Float[Array, " n"]) -> Float[Array, "..."] | None:
+    """The mass matrix of the entries that are free, for the others the unit matrix."""
+    if mass is None or mass.ndim < 2:
+        return mass
+    if mass.ndim == 3:
+        return jax.vmap(of_rows)(mass, free.reshape(mass.shape[:2]))
+    return of_rows(mass, free)

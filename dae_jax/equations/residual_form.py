@@ -118,7 +118,7 @@ class ResidualForm(eqx.Module):
         a, mass = ode.constraint_jacobian(t, *flat), dense_mass(ode.mass(flat[0]))
         squares = jnp.sum(a * a, 1)
         squares = jnp.where(squares > 0, squares, 1)
-        masses = jnp.ones_like(squares) if mass is None else jnp.sum(a * _weighted(mass, a.T).T, 1) / squares
+        masses = jnp.ones_like(squares) if mass is None else jnp.sum(a * weighted(mass, a.T).T, 1) / squares
         # Where all that a constraint ties together is massless, that of the others has to do.
         masses = jnp.where(masses > 0, masses, jnp.max(masses))
         units = jax.lax.stop_gradient(jnp.where(masses > 0, masses, 1) / jnp.sqrt(squares))
@@ -172,18 +172,18 @@ class ResidualForm(eqx.Module):
         q, v = y[:n], y[n : 2 * n]
         multipliers, eta = jnp.split(y[2 * n :] if self.units is None else y[2 * n :] * self.units, [m + p])
         a, mass = ode.constraint_jacobian(t, q, v), dense_mass(ode.mass(q))
-        momentum = _weighted(mass, yd[n : 2 * n]) - ode.force(t, q, v) + jnp.sum(multipliers[:, None] * a, 0)
+        momentum = weighted(mass, yd[n : 2 * n]) - ode.force(t, q, v) + jnp.sum(multipliers[:, None] * a, 0)
         velocity = ode.velocity_constraint(t, q, v)
         kinematics = yd[:n] - v
         if self.form == "index-3":
             return jnp.concatenate([kinematics, momentum, ode.constraint(t, q), velocity[m:]])
         if self.form == "index-2":
             return jnp.concatenate([kinematics, momentum, velocity])
-        stabilised = _weighted(mass, kinematics) + jnp.sum(eta[:, None] * a[:m], 0)
+        stabilised = weighted(mass, kinematics) + jnp.sum(eta[:, None] * a[:m], 0)
         return jnp.concatenate([stabilised, momentum, velocity, ode.constraint(t, q)])
 
 
-def _weighted(mass: Float[Array, "..."] | None, x: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
+def weighted(mass: Float[Array, "..."] | None, x: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
     """M x."""
     if mass is None:
         return x
@@ -204,7 +204,7 @@ def bordered_multipliers(
     n, c = ode.layout.size, len(a)
     if mass is None or n + c > BORDERED:
         return ode.multipliers(t, y) / units
-    momentum = jnp.concatenate([_weighted(mass, jnp.eye(n, dtype=a.dtype)), a.T * units], 1)
+    momentum = jnp.concatenate([weighted(mass, jnp.eye(n, dtype=a.dtype)), a.T * units], 1)
     matrix = jnp.concatenate([momentum, jnp.concatenate([a, jnp.zeros((c, c), a.dtype)], 1)])
     right = jnp.concatenate([ode.force(t, *y), -ode.bias(t, *y)])
     largest = jnp.max(jnp.abs(matrix), 1)

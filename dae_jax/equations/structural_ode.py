@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -34,6 +33,7 @@ from .derivative_orders import Combination, derivative_of, find_offsets
 from .initial_rates import is_nonlinear, rates_of
 from .manifold_ode import Feedback, ManifoldODE, at_one_instant
 from .mechanical import MechanicalODE
+from .nearest_point import nearest_point
 from .nearest_step import step_to
 from .probe import Probe
 from .residual_form import LARGE, ResidualForm
@@ -41,7 +41,7 @@ from .sparse_invariants import FREE, SparseInvariants
 from .taylor import total_derivatives
 
 
-# Gauss–Newton's method for the derivatives of the initial state.
+# Gauss–Newton's method for what is left of H at the initial state.
 STARTING = 100
 # A selection of states is kept until its smallest pivot is less than this part of the best one's.
 HYSTERESIS = 0.3
@@ -387,35 +387,40 @@ class StructuralODE(ManifoldODE):
 def _nearest(ode: StructuralODE, t: Time, known: Float[Array, " N"], weights: Float[Array, " N"]) -> Any:
     if not any(ode.orders.equations):
         return known
+    is_value = ode.orders.values >= 0
 
-    def moved(y: Float[Array, " N"], start: Float[Array, " N"], params: PyTree) -> Any:
-        """The point next to `start` on the linearisation of H = 0 at y."""
+    def moved(y: Float[Array, " N"], aim: Float[Array, " N"], params: PyTree) -> Any:
+        """The point next to `aim` on the linearisation of H = 0 at y."""
         ode, t, _, weights, *_ = params
         if ode.sparse is not None:
-            return ode.sparse.nearest(ode, t, y, start, weights)
+            return ode.sparse.nearest(ode, t, y, aim, weights)
         a, h = ode.normals(t, y), ode.violations(t, y)
-        return start + step_to(a, h + jnp.sum(a * (start - y), 1), weights, ode.orders.values < 0)
-
-    def settled(params: PyTree, y: Float[Array, " N"], towards: Callable[[Array], Array]) -> Any:
-        def correct(y: Float[Array, " N"]) -> Any:
-            new = moved(y, towards(y), params)
-            return new, relative_change(new - y, y)
-
-        return fixed_point(correct, y, max_steps=STARTING)
-
-    # Derivatives have nothing to be near to but what the equations make of them; the rest of a pull keeps those that the
-    # equations leave open from being undetermined.
-    is_value = ode.orders.values >= 0
-    pull = jnp.finfo(known.dtype).eps ** 0.6
-    aim = lambda y, params: jnp.where(is_value, params[2], y - pull * (y - params[4]))
+        return aim + step_to(a, h + jnp.sum(a * (aim - y), 1), weights, ~is_value)
 
     def iterate(params: PyTree) -> Any:
-        # The nearest point, then what `cut` has left of H there.
-        near, _ = settled(params, params[4], lambda y: aim(y, params))
-        return settled(params, near, lambda y: y)
+        def correct(y: Float[Array, " N"]) -> Any:
+            new = moved(y, y, params)
+            return new, relative_change(new - y, y)
 
-    first, _ = settled((ode, t, known, weights), known, lambda y: jnp.where(is_value, known, y))
-    params = (ode, t, known, weights, lax.stop_gradient(first))
+        # The nearest point, then what `cut` has left of H there.
+        return fixed_point(correct, params[4], max_steps=STARTING)
+
+    given = ode, t, known, weights
+    measured = is_value & (weights > 0)
+    scale = jnp.where(measured, 1 / jnp.where(measured, weights, 1), 0)
+    # Derivatives have nothing to be near to but what the equations make of them; a little of a pull keeps those that the
+    # equations leave open from being undetermined.
+    pull = jnp.finfo(known.dtype).eps ** 0.6
+    aim = lambda y, params: jnp.where(is_value, params[2], y - pull * (y - params[4]))
+    held = jax.tree.map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, given)
+    first = nearest_point(
+        lambda y, aim: moved(y, aim, held),
+        held[2],
+        lambda y: jnp.where(is_value, held[2], y),
+        lambda a, b: jnp.sum(scale * a * scale * b),
+        measured,
+    )
+    params = (*given, first)
     return implicit_root(
         lambda y, p: y - moved(y, aim(y, p), p), iterate, params, jacobian=_by_y if ode.sparse else None
     )[0]

@@ -1,5 +1,6 @@
 """`consistent_state` gives the nearest state, however fast the dynamics are."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -46,3 +47,81 @@ def test_a_step_is_the_shortest_in_the_values(fixed):
     np.testing.assert_allclose(x[:6], shortest, atol=1e-10)
     np.testing.assert_allclose(of_values @ x[:6] + of_rates @ x[6:], -off, atol=1e-9)
     assert x[9] == 0
+
+
+def ellipse(x):
+    return x[0] ** 2 / 9 + x[1] ** 2 - 1
+
+
+def distance_to_ellipse(x):
+    """The least over all of it."""
+    angles = np.linspace(0, 2 * np.pi, 1_000_001)
+    return np.hypot(3 * np.cos(angles) - x[0], np.sin(angles) - x[1]).min()
+
+
+ON_ELLIPSE = {
+    "mechanism": dae_jax.ConstrainedSystem(lambda t, q, v, a: 0 * q, lambda t, q, a: ellipse(q)),
+    "residual": dae_jax.ImplicitDAE(lambda t, y, yd, a: jnp.stack([yd[0] - 1, ellipse(y)])),
+}
+
+
+def nearest_on_ellipse(kind, x):
+    start = (x, jnp.zeros(2)) if kind == "mechanism" else x
+    found = dae_jax.consistent_state(ON_ELLIPSE[kind], 0.0, start)
+    return found[0] if kind == "mechanism" else found
+
+
+@pytest.mark.parametrize("kind", list(ON_ELLIPSE))
+@pytest.mark.parametrize("x", [(4.0, 0.3), (2.5, 0.0), (30.0, 3.0), (0.0, 0.1), (100.0, -50.0), (0.01, 0.0)])
+def test_far_from_what_is_curved(kind, x):
+    """Farther off than the radius of curvature, and where symmetry leads to a farthest point."""
+    x = jnp.array(x)
+    found = nearest_on_ellipse(kind, x)
+    assert abs(ellipse(found)) < 1e-14
+    assert np.linalg.norm(found - x) == pytest.approx(distance_to_ellipse(x), rel=1e-10)
+
+
+@pytest.mark.parametrize("kind", list(ON_ELLIPSE))
+def test_derivative_far_from_what_is_curved(kind):
+    x, step = jnp.array([4.0, 0.3]), 1e-5
+    of_x = lambda x: nearest_on_ellipse(kind, x)
+    differences = np.stack([(of_x(x + step * e) - of_x(x - step * e)) / (2 * step) for e in np.eye(2)], 1)
+    for derivative in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(derivative(of_x)(x), differences, atol=1e-8)
+
+
+@pytest.mark.parametrize("form", ["dense", "blocks"])
+def test_fixed_coordinates_of_a_coupled_mass(form):
+    """Of the coordinates that are free the least kinetic distance; positions and velocities."""
+    mass = np.array([[2.0, 0.9, 0.4, 0.0], [0.9, 1.0, 0.3, 0.0], [0.4, 0.3, 3.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    if form == "blocks":
+        mass[2, :2] = mass[:2, 2] = 0
+    given = jnp.array([mass[:2, :2], mass[2:, 2:]]) if form == "blocks" else jnp.asarray(mass)
+    normal = np.array([1.0, 2.0, -1.0, 0.5])
+    system = dae_jax.ConstrainedSystem(lambda t, q, v, a: 0 * q, lambda t, q, a: normal @ q - 1, mass=given)
+    q0, v0 = np.array([0.3, 0.1, 0.2, 0.4]), np.array([1.0, -1.0, 2.0, 0.5])
+    kept = np.array([True, False, False, False])
+    q, v = dae_jax.consistent_state(system, 0.0, (q0, v0), fixed=(kept, kept))
+    free = np.arange(1, 4)
+    inverse = np.linalg.inv(mass[np.ix_(free, free)])
+    way = inverse @ normal[free] / (normal[free] @ inverse @ normal[free])
+    np.testing.assert_allclose(q[free], q0[free] - way * (normal @ q0 - 1), atol=1e-14)
+    np.testing.assert_allclose(v[free], v0[free] - way * (normal @ v0), atol=1e-14)
+    assert q[0] == q0[0] and v[0] == v0[0]
+
+
+@pytest.mark.parametrize(
+    ("residual", "y"),
+    [
+        (lambda t, y, yd, a: yd**3 - y, [8.0]),
+        (lambda t, y, yd, a: yd**2 - y, [4.0]),
+        (lambda t, y, yd, a: jnp.exp(yd) - y, [1e4]),
+        (lambda t, y, yd, a: jnp.stack([yd[0] ** 2 - y[1], y[1] - y[0] ** 2]), [2.0, 4.0]),
+        (lambda t, y, yd, a: jnp.stack([jnp.sum(yd**2) - 1, jnp.sum(y**2) - 1]), [0.6, 0.8]),
+    ],
+    ids=["cubic", "square", "exponential", "hidden", "speed"],
+)
+def test_consistent_starts_stay_where_rates_are_nonlinear(residual, y):
+    np.testing.assert_allclose(
+        dae_jax.consistent_state(dae_jax.ImplicitDAE(residual), 0.0, jnp.array(y)), y, rtol=1e-14
+    )

@@ -1,0 +1,75 @@
+"""The point of a manifold that is nearest to a given one, however far off and however curved."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from ..linalg import relative_change, roundoff
+from ..types import Flat, Scalar
+
+
+STEPS = 300
+# Steps that would have to be shorter lead nowhere.
+SHORTEST = 2.0**-20
+# By what a step onto the manifold shortens the next one where the linearisation says how far off a point is.
+QUICK = 0.3
+# More than 1, so that the merit is least on the manifold.
+PENALTY = 3.0
+# A start that is off is moved aside by this part of that, lest symmetry keep it on the way to a farthest point.
+ASIDE = 1e-3
+
+
+def nearest_point(
+    linearised: Callable[[Float[Array, " n"], Float[Array, " n"]], Float[Array, " n"]],
+    start: Float[Array, " n"],
+    aims: Callable[[Float[Array, " n"]], Float[Array, " n"]],
+    inner: Callable[[Float[Array, " n"], Float[Array, " n"]], Float[Array, ""]],
+    movable: Bool[Array, " n"],
+) -> Float[Array, " n"]:
+    """y on the manifold H(y) = 0 at the least distance from `start`, by Gauss–Newton steps.
+
+    `linearised(y, aim)` is the point next to `aim` on the linearisation of H = 0 at y, `aims(y)` what y is to be near to, and
+    |x|² = `inner(x, x)`, in which what is not measured does not occur; `movable` is what is measured and free.
+
+    First onto the manifold. Then a step is as long as makes the merit |y − start| + 3 |A⁺H| less, whose second term is about how far y is from the
+    manifold: by the triangle inequality no point off the manifold has less than the nearest one. Full steps converge only
+    where the distance is less than the radius of curvature; their length is therefore the inverse of the slope that was
+    seen in the last one (J. Barzilai, J. M. Borwein, IMA J. Numer. Anal. 8 (1988), 141–148), 1 at most.
+    """
+    length = lambda x: jnp.sqrt(inner(x, x))
+
+    def look(y: Flat, left: Scalar, arrived: Bool[Array, ""]) -> tuple[Flat, Scalar, Scalar, Bool[Array, ""]]:
+        near, onto = jax.vmap(lambda aim: linearised(y, aim))(jnp.stack([aims(y), y]))
+        before, left = left, length(onto - y)
+        arrived = arrived | (left <= QUICK * before)
+        return jnp.where(arrived, near, onto) - y, length(y - start) + PENALTY * left, left, arrived
+
+    def step(carry: Any) -> Any:
+        y, way, merit, left, arrived, part, count = carry
+        off = jnp.max(jnp.abs(jnp.where(movable, way, 0)), initial=0)
+        aside = jnp.where((count == 1) & movable & (off > roundoff(y.dtype) ** 0.5), ASIDE * off * directions, 0)
+        trial = y + part * way + aside
+        new = look(trial, left, arrived)
+        # Near the end differences of the merit are round-off, and ways get shorter.
+        level = (new[1] - merit <= jnp.sqrt(roundoff(y.dtype)) * merit) & (size(new[0], trial) <= size(way, y))
+        better = (new[1] <= merit) | level | ~arrived
+        moved, turned = trial - y, way - new[0]
+        inverse = inner(moved, moved) / inner(moved, turned)
+        longer = jnp.where((inverse > 0) & arrived, jnp.minimum(inverse, 1), 1)
+        kept = jax.tree.map(lambda a, b: jnp.where(better, a, b), (trial, *new, longer), (*carry[:5], part / 2))
+        return *kept, count + 1
+
+    def unfinished(carry: Any) -> Bool[Array, ""]:
+        y, way, _, _, _, part, count = carry
+        return (count == 0) | (size(way, y) > roundoff(y.dtype)) & (part > SHORTEST) & (count < STEPS)
+
+    size = relative_change
+    directions = np.random.default_rng(0).uniform(-1, 1, start.shape)
+    one = jnp.ones((), start.dtype)
+    first = start, jnp.zeros_like(start), one * jnp.inf, 0 * one, jnp.asarray(False), one, 0
+    return lax.while_loop(unfinished, step, first)[0]
