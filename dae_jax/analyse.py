@@ -14,6 +14,7 @@ from scipy.sparse import csr_array
 
 from .compiler import at_ease
 from .equations.derivative_orders import Offsets, find_offsets
+from .equations.initial_rates import is_nonlinear, rates_of
 from .equations.residual_form import ResidualForm
 from .equations.slopes import Slopes
 from .equations.taylor import total_derivatives
@@ -52,8 +53,9 @@ class Structure:
       the canonical one.
     - `transversal`: the variable that each equation is paired with.
     - `blocks`: the block triangular form of the differentiated system, in the order of solution.
-    - `regular`: whether the system Jacobian ∂Fᵢ/∂xⱼ^(dⱼ−cᵢ) is nonsingular near the given state. If not, the structure
-      misleads and the index may be higher.
+    - `regular`: whether the system Jacobian ∂Fᵢ/∂xⱼ^(dⱼ−cᵢ) is nonsingular near the given state, at generic
+      derivatives or, where the equations are nonlinear in ẏ, at those that they have there. If not, the structure misleads
+      and the index may be higher.
     - `nonzeros`, `bandwidth`: of the incidence matrix, as the equations and variables are ordered.
 
     Source: J. D. Pryce, A simple structural analysis method for DAEs, BIT 41 (2001); C. C. Pantelides, SIAM J. Sci.
@@ -262,7 +264,7 @@ def _differentiated(times: int) -> str:
 
 
 def _regular(form: ResidualForm, found: Offsets, blocks: tuple[Block, ...], t: Time, y: Flat) -> bool:
-    """Whether the system Jacobian has full rank at the state, for generic derivatives and multipliers."""
+    """Whether the system Jacobian has full rank at the state, for generic multipliers and derivatives; see `_rates`."""
     slopes = Slopes(form.residual, found.variables, found.combination.degree, y.dtype)
     rows, columns, equations, times, orders, factors = (
         np.array(part)
@@ -276,16 +278,31 @@ def _regular(form: ResidualForm, found: Offsets, blocks: tuple[Block, ...], t: T
             strict=True,
         )
     )
+    yd = _rates(form, t, y)
     for seed in range(3):
-        values = factors * slopes.entries(_at_state(slopes, form, t, y, seed), times, equations, orders, columns)
+        values = factors * slopes.entries(_at_state(slopes, form, t, y, seed, yd), times, equations, orders, columns)
         matrix = csr_array((values, (rows, columns)), shape=(len(y), len(y)))
         if is_nonsingular(matrix, blocks, float(jnp.finfo(y.dtype).eps)):
             return True
     return False
 
 
-def _at_state(slopes: Slopes, form: ResidualForm, t: Time, y: Flat, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """What `slopes` give at a state, for generic derivatives and multipliers."""
+def _at_state(
+    slopes: Slopes, form: ResidualForm, t: Time, y: Flat, seed: int = 0, yd: Flat | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """What `slopes` give at a state, for generic multipliers and derivatives, the first ones `yd` where that is given."""
     rng = np.random.default_rng(seed)
     at = y.at[form.layout.size :].set(rng.normal(size=form.extra))
-    return slopes.at(t, jnp.stack([at, *jnp.asarray(rng.normal(size=slopes.shape), y.dtype)[1:]]))
+    derivatives = jnp.asarray(rng.normal(size=slopes.shape), y.dtype)[1:]
+    if yd is not None:
+        derivatives = derivatives.at[0].set(yd)
+    return slopes.at(t, jnp.concatenate([at[None], derivatives]))
+
+
+def _rates(form: ResidualForm, t: Time, y: Flat) -> Flat | None:
+    """ẏ of the equations, where they are nonlinear in it and have one at the state: what is regular for others may be singular there."""
+    if not is_nonlinear(form, y.dtype):
+        return None
+    yd, _ = rates_of(form, t, y)
+    off = jnp.max(jnp.abs(form.residual(t, y, yd)))
+    return yd if off <= jnp.finfo(y.dtype).eps ** 0.5 * (1 + jnp.max(jnp.abs(yd))) else None

@@ -39,7 +39,9 @@ class OnStates(eqx.Module):
 
     def __call__(self, t: Time, y: Y, args: Any, **kwargs: object) -> Any:
         t = self.direction * t
-        value = self.condition(t, self.decode(t, y, args), self.args, **self.given)
+        value = jnp.asarray(self.condition(t, self.decode(t, y, args), self.args, **self.given))
+        # diffrax puts it beside a number of the widest kind.
+        value = value.astype(float) if jnp.issubdtype(value.dtype, jnp.floating) else value
         # NaN crosses in no direction: it ends the solve here, which then says so.
         return value if self.up is None else jnp.where(jnp.isnan(value), 1 if self.up else -1, value)
 

@@ -29,17 +29,17 @@ def nearest_point(
     start: Float[Array, " n"],
     aims: Callable[[Float[Array, " n"]], Float[Array, " n"]],
     inner: Callable[[Float[Array, " n"], Float[Array, " n"]], Float[Array, ""]],
-    movable: Bool[Array, " n"],
+    movable: Bool[Array, " n"] | Bool[np.ndarray, " n"],
 ) -> Float[Array, " n"]:
     """y on the manifold H(y) = 0 at the least distance from `start`, by Gauss–Newton steps.
 
     `linearised(y, aim)` is the point next to `aim` on the linearisation of H = 0 at y, `aims(y)` what y is to be near to, and
     |x|² = `inner(x, x)`, in which what is not measured does not occur; `movable` is what is measured and free.
 
-    First onto the manifold. Then a step is as long as makes the merit |y − start| + 3 |A⁺H| less, whose second term is about how far y is from the
-    manifold: by the triangle inequality no point off the manifold has less than the nearest one. Full steps converge only
-    where the distance is less than the radius of curvature; their length is therefore the inverse of the slope that was
-    seen in the last one (J. Barzilai, J. M. Borwein, IMA J. Numer. Anal. 8 (1988), 141–148), 1 at most.
+    First onto the manifold. Then a step is as long as makes the merit |y − start| + 3 |A⁺H| less, whose second term is about
+    how far y is from the manifold: by the triangle inequality no point off the manifold has less than the nearest one. Full
+    steps converge only where the distance is less than the radius of curvature; their length is therefore the inverse of
+    the slope that was seen in the last one (J. Barzilai, J. M. Borwein, IMA J. Numer. Anal. 8 (1988), 141–148), 1 at most.
     """
     length = lambda x: jnp.sqrt(inner(x, x))
 
@@ -69,7 +69,7 @@ def nearest_point(
         return (count == 0) | (size(way, y) > roundoff(y.dtype)) & (part > SHORTEST) & (count < STEPS)
 
     size = relative_change
-    directions = np.random.default_rng(0).uniform(-1, 1, start.shape)
+    directions = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, start.shape), start.dtype)
     one = jnp.ones((), start.dtype)
     first = start, jnp.zeros_like(start), one * jnp.inf, 0 * one, jnp.asarray(False), one, 0
     return lax.while_loop(unfinished, step, first)[0]

@@ -81,7 +81,10 @@ class _Reader:
         data.qpos[:] = model.qpos0
         mujoco.mj_kinematics(model, data)
         self._refuse_other_physics()
-        self.bodies = {int(i): body for i in np.unique(model.body_weldid) if i and (body := self._body(int(i)))}
+        if not model.njnt:
+            self.unsupported.append("a model in which nothing moves: it has no joints")
+        welded = [int(i) for i in np.unique(model.body_weldid) if model.body_jntnum[i]]
+        self.bodies = {i: body for i in welded if (body := self._body(i))}
         for i in self.bodies:
             self._joints_of(i)
         for k in range(0 if self._disabled("EQUALITY", "CONSTRAINT") else model.neq):
@@ -135,7 +138,11 @@ class _Reader:
     def _refuse_field(self, kind: str, field: str) -> None:
         """What is set (0 and −1 are nothing) of a field that is not known."""
         rows = np.asarray(getattr(self.model, field))
-        if rows.ndim == 0 or (field == "dof_frictionloss" and self._disabled("FRICTIONLOSS", "CONSTRAINT")):
+        if (
+            rows.size == 0
+            or rows.ndim == 0
+            or (field == "dof_frictionloss" and self._disabled("FRICTIONLOSS", "CONSTRAINT"))
+        ):
             return
         owners = np.flatnonzero(((rows != 0) & (rows != -1)).reshape(len(rows), -1).any(1))
         if kind == "dof":
@@ -181,7 +188,7 @@ class _Reader:
             self._add(joints.prismatic(parent, body, at, axis=axes[0], name=name), {ids[0]: "displacement"})
         elif kinds == [BALL]:
             self._add(joints.spherical(parent, body, at, name=name), {})
-        elif sorted(kinds) == [SLIDE, HINGE] and axes[0] @ axes[1] > 1 - NEAR:
+        elif sorted(kinds) == [SLIDE, HINGE] and np.linalg.norm(axes[0] - axes[1]) < NEAR:
             hinge, slide = ids if kinds[0] == HINGE else ids[::-1]
             joint = joints.cylindrical(parent, body, data.xanchor[hinge], axis=axes[0], name=name)
             self._add(joint, {hinge: "angle", slide: "displacement"})

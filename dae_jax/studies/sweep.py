@@ -1,9 +1,8 @@
 """`sweep`: a function of one element over many, in chunks, on all cores and devices, resumable."""
 
+import dataclasses
 import functools
-import hashlib
 import os
-import re
 import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -13,21 +12,19 @@ from typing import Any, Protocol
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
-from jax.extend.core import ClosedJaxpr
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import PyTree
 
 from ..compiler import at_ease, processors
-from ..compiler.jaxprs.walk import equations, held_by
 from ..driver.failures import sentence_of
 from ..solution import RESULTS
 from ..types import State
 from ..validate.captured import current
 from ..validate.states import brief
 from ..validate.user_functions import TRACED
+from .fingerprint import fingerprint
 from .grid import Grid
 from .progress import Progress
 from .sweep_store import Memory, Store
@@ -66,13 +63,14 @@ def sweep(
 
     - `fn`: any JAX function of one element to a pytree of arrays, usually a `daesolve(..., throw=False)` and what is to
       be kept of it: a final state, a maximum of the drift, an energy error. What it returns is all that is kept.
-    - `inputs`: a pytree of arrays with a common leading axis, or a `grid`.
+    - `inputs`: a pytree of arrays, also of `jax.random.split(key)`, with a common leading axis, or a `grid`.
     - `chunk_size`: elements of one compiled call; by default 512 for each CPU device, on each GPU 131,072, or as many as a
       sixteenth of its memory holds the inputs and results of, and 8192 for each other accelerator.
     - `devices`: by default all of this process. On one CPU device several chunks run at once, one for each core.
     - `progress`: a bar on stderr, with the rate, the time left, and how many solves failed; at the end, why.
     - `store`: a folder. Results are written there as they come; the same sweep with the same folder goes on where it was
-      interrupted, also by a kill, and ends with the same bits. The result's arrays are then files mapped into memory.
+      interrupted, also by a kill, and ends with the same bits. The result's arrays are then files mapped into memory, in
+      which what one writes into them does not end up. What `fn` calls in Python is recognised by its code.
 
     Under `jax.distributed.initialize` every process computes its share and all return the whole; `store` must then be a
     folder that all see.
@@ -86,14 +84,16 @@ def sweep(
     """
     if not callable(fn):
         raise TypeError(f"`fn` must be a function of one element, but is {brief(fn)}.")
-    fn = current(fn)
-    elements = inputs.elements() if isinstance(inputs, Grid) else jax.tree.map(np.asarray, inputs)
+    fn, elements = current(fn), inputs.elements() if isinstance(inputs, Grid) else inputs
+    if any(map(_is_key, jax.tree.leaves(elements))):
+        fn, elements = OfKeys.of(fn, elements)
+    elements = jax.tree.map(np.asarray, elements)
     size = _leading(elements)
     devices = list(devices or jax.local_devices())
-    if chunk_size is not None and chunk_size < 1:
-        raise ValueError(f"`chunk_size` must be at least 1, but is {chunk_size}.")
+    if chunk_size is not None and (chunk_size != int(chunk_size) or chunk_size < 1):
+        raise ValueError(f"`chunk_size` must be an integer, at least 1, but is {chunk_size}.")
     try:
-        lanes = _lanes(fn, elements, devices[0]) if chunk_size is None else -(-chunk_size // len(devices))
+        lanes = _lanes(fn, elements, devices[0]) if chunk_size is None else -(-int(chunk_size) // len(devices))
         chunk = min(lanes, -(-size // len(devices))) * len(devices)
         call, out = _compiled(fn, elements, chunk, devices)
     except TRACED as error:
@@ -107,7 +107,7 @@ def sweep(
     kept = (
         Memory(leaves, chunks)
         if store is None
-        else Store.open(Path(store), leaves, chunks, _fingerprint(fn, elements, chunk))
+        else Store.open(Path(store), leaves, chunks, fingerprint(fn, _one(elements), elements, chunk))
     )
     failures = _failures(structure)
     progress = progress and jax.process_index() == 0
@@ -139,7 +139,37 @@ def _one(elements: PyTree) -> PyTree:
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], jax.dtypes.canonicalize_dtype(x.dtype)), elements)
 
 
+@dataclasses.dataclass(frozen=True)
+class OfKeys:
+    """`fn` of elements whose keys of `jax.random.key`, the leaves that have one of `kinds`, are numbers."""
+
+    fn: Callable[..., PyTree]
+    kinds: tuple[str | None, ...]
+
+    @classmethod
+    def of(cls, fn: Callable[..., PyTree], elements: PyTree) -> tuple["OfKeys", PyTree]:
+        """The function, and the elements as numbers."""
+        leaves, structure = jax.tree.flatten(elements)
+        kinds = tuple(str(jax.random.key_impl(x)) if _is_key(x) else None for x in leaves)
+        numbers = [jax.random.key_data(x) if _is_key(x) else x for x in leaves]
+        return cls(fn, kinds), jax.tree.unflatten(structure, numbers)
+
+    def __call__(self, element: PyTree) -> PyTree:
+        leaves, structure = jax.tree.flatten(element)
+        keyed = [
+            x if k is None else jax.random.wrap_key_data(x, impl=k) for x, k in zip(leaves, self.kinds, strict=True)
+        ]
+        return self.fn(jax.tree.unflatten(structure, keyed))
+
+
+def _is_key(x: object) -> bool:
+    return isinstance(x, jax.Array) and jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
 def _leading(elements: PyTree) -> int:
+    wrong = [x for x in jax.tree.leaves(elements) if not (jax.dtypes.issubdtype(x.dtype, np.number) or x.dtype == bool)]
+    if wrong:
+        raise TypeError(f"`inputs` must be arrays of numbers, but holds {brief(wrong[0])}.")
     shapes = [x.shape for x in jax.tree.leaves(elements)]
     sizes = {s[0] if s else None for s in shapes}
     if len(sizes) != 1 or None in sizes or 0 in sizes:
@@ -256,16 +286,3 @@ def _state(
 def _gathered(x: np.ndarray) -> np.ndarray:
     """The array of every process, one below the other."""
     return np.asarray(multihost_utils.process_allgather(x))
-
-
-def _fingerprint(fn: Callable[..., PyTree], elements: PyTree, chunk: int) -> str:
-    """What makes two sweeps the same: the function as it is traced, its constants at any depth, the elements, and the chunks."""
-    closed = jax.make_jaxpr(fn)(_one(elements))
-    found = hashlib.sha256(re.sub(r"0x[0-9a-f]+", "", str(closed)).encode())
-    inner = (jaxpr for eqn in equations(closed) for jaxpr in held_by(eqn))
-    constants = (x for jaxpr in (closed, *inner) if isinstance(jaxpr, ClosedJaxpr) for x in jaxpr.consts)
-    for x in [*constants, *jax.tree.leaves(elements)]:
-        x = np.asarray(x)
-        found.update(f"{x.dtype}{x.shape}".encode() + x.tobytes())
-    found.update(f"{chunk} {jax.__version__} {jnp.zeros(()).dtype}".encode())
-    return found.hexdigest()

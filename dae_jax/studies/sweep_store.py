@@ -82,7 +82,8 @@ class Store(Memory):
         if gather is not None:
             # What others wrote is in the same files once they are there.
             multihost_utils.sync_global_devices("dae_jax.sweep end")
-        return list(self.arrays)
+        # Copied when written to: the results are the caller's, the files the sweep's.
+        return [*(np.memmap(x.filename, x.dtype, "c", x.offset, x.shape) for x in self.arrays if x.filename)]
 
 
 def _create(folder: Path, shapes: list[tuple[str, Any, Any]], fingerprint: str) -> None:

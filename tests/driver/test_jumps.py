@@ -51,6 +51,18 @@ def test_a_ball_bounces_when_it_should(solver):
     np.testing.assert_allclose(sol.ys[0][:, 1], exact, atol=1e-8)
 
 
+@pytest.mark.parametrize("solver", [dae_jax.OrthogonalProjection(diffrax.Tsit5()), dae_jax.RadauIIA5()])
+def test_in_single_precision_among_double_ones(solver):
+    """States of float32 where x64 is on: after a bounce, and the time of an event."""
+    y0, e = (jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), x) for x in (RELEASED, 0.9))
+    solve = lambda t1, event: dae_jax.daesolve(BALL, solver, 0.0, t1, None, y0, e, event=event)
+    (q, _), landing = solve(2.1, BOUNCE).final, lambda t, y, e, **_: y[0][1]
+    assert q.dtype == jnp.float32
+    assert q[1] == pytest.approx(height(0.9, 2.1), abs=1e-4)
+    event = diffrax.Event(landing, optimistix.Newton(1e-5, 1e-5))
+    assert solve(2.1, event).ts[-1] == pytest.approx(bounces(0.9)[0], abs=1e-5)
+
+
 def test_derivatives_through_jumps():
     end = lambda e, adjoint: bouncing(e, 2.2, adjoint).ys[0][-1, 1]
     h = 1e-6

@@ -107,7 +107,8 @@ def test_fixed_coordinates_of_a_coupled_mass(form):
     way = inverse @ normal[free] / (normal[free] @ inverse @ normal[free])
     np.testing.assert_allclose(q[free], q0[free] - way * (normal @ q0 - 1), atol=1e-14)
     np.testing.assert_allclose(v[free], v0[free] - way * (normal @ v0), atol=1e-14)
-    assert q[0] == q0[0] and v[0] == v0[0]
+    assert q[0] == q0[0]
+    assert v[0] == v0[0]
 
 
 @pytest.mark.parametrize(

@@ -77,6 +77,27 @@ def test_all_that_is_not_supported_is_listed():
         assert part in str(refusal.value)
 
 
+GEOM = '<geom size=".1" mass="1" pos=".5 0 0"/>'
+
+
+@pytest.mark.parametrize(
+    ("bodies", "said"),
+    [
+        (f'<body name="a">{GEOM}</body>', "nothing moves"),
+        (f'<body mocap="true">{GEOM}</body><body name="a"><joint/>{GEOM}</body>', "1 mocap bodies"),
+        # A milliradian apart.
+        (
+            f'<body name="a"><joint name="j"/><joint name="s" type="slide" axis=".001 0 1"/>{GEOM}</body>',
+            "joints 'j', 's' of body 'a' together",
+        ),
+    ],
+    ids=["no joints", "mocap", "not quite parallel"],
+)
+def test_what_is_no_mechanism_here_is_refused(bodies, said):
+    with pytest.raises(ValueError, match=said):
+        m.read_mjcf(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+
+
 def test_urdf_is_read():
     urdf = """<robot name="r"><link name="base"/><link name="arm"><inertial><origin xyz="0 0 0.5"/><mass value="1"/>
     <inertia ixx="0.1" iyy="0.1" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>

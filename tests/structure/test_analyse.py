@@ -178,6 +178,14 @@ def test_a_singular_jacobian_behind_a_regular_structure_is_found():
     assert "Replace an equation by a combination" in str(found)
 
 
+def test_what_is_singular_at_the_rates_of_the_equations_is_found():
+    """ẏ₀ = y₁ and ẏ₀² = y₁² are one equation at each solution, and two for other ẏ."""
+    twice = implicit(lambda t, y, yd, args: jnp.stack([yd[0] - y[1], yd[0] ** 2 - y[1] ** 2]))
+    assert not dae_jax.analyse(twice, 0.0, jnp.array([1.0, 0.5])).regular
+    crossing = implicit(lambda t, y, yd, args: jnp.stack([yd[0] - y[1], yd[0] ** 2 - y[1]]))
+    assert dae_jax.analyse(crossing, 0.0, jnp.array([1.0, 0.5])).regular
+
+
 def test_an_equation_given_twice_is_no_equation():
     found = dae_jax.analyse(
         implicit(lambda t, y, yd, a: jnp.stack([yd[0] + y[1], 2 * yd[0] + 2 * y[1]])), 0.0, jnp.ones(2)

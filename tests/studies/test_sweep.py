@@ -116,6 +116,49 @@ def test_functions_that_differ_in_a_constant_alone_are_other_sweeps(tmp_path, of
             sweep(c)
 
 
+@pytest.mark.parametrize("factor", [2.0, np.array([2.0])], ids=["constant", "closed over"])
+def test_what_python_computes_counts(tmp_path, factor):
+    def of(factor):
+        by = (lambda x: np.asarray(x * factor)) if isinstance(factor, np.ndarray) else eval(f"lambda x: x * {factor}")
+        of_one = lambda x: jax.pure_callback(by, jax.ShapeDtypeStruct((1,), float), x[None], vmap_method="expand_dims")
+        return dae_jax.sweep(of_one, np.arange(4.0), store=tmp_path / "s", progress=False)
+
+    first = of(factor)
+    np.testing.assert_array_equal(of(factor), first)
+    with pytest.raises(ValueError, match="holds another sweep"):
+        of(factor + 1)
+
+
+def test_what_is_written_into_the_results_stays_out_of_the_store(tmp_path):
+    run = lambda: dae_jax.sweep(lambda x: x, np.ones(3), store=tmp_path / "s", progress=False)
+    run()[:] = 7
+    np.testing.assert_array_equal(run(), 1)
+
+
+# Keys
+
+
+def test_keys_are_elements(tmp_path):
+    keys, draw = jax.random.split(jax.random.key(0), 6), lambda key: jax.random.normal(key, (2,))
+    wanted = jax.vmap(draw)(keys)
+    for store in (None, tmp_path / "s"):
+        np.testing.assert_array_equal(dae_jax.sweep(draw, keys, chunk_size=4, store=store, progress=False), wanted)
+    inputs = {"k": keys, "x": np.arange(6.0)}
+    found = dae_jax.sweep(lambda e: e["x"] * draw(e["k"]), inputs, progress=False)
+    np.testing.assert_array_equal(found, inputs["x"][:, None] * wanted)
+
+
+@pytest.mark.parametrize("inputs", [np.array(["a", "b"]), np.array([None, 1])], ids=["strings", "objects"])
+def test_inputs_that_are_no_numbers_are_refused(inputs):
+    with pytest.raises(TypeError, match="must be arrays of numbers"):
+        dae_jax.sweep(lambda x: x, inputs)
+
+
+def test_a_chunk_is_a_whole_number():
+    with pytest.raises(ValueError, match="must be an integer"):
+        dae_jax.sweep(lambda x: x, np.ones(3), chunk_size=2.5)
+
+
 def test_a_folder_of_something_else_is_refused(tmp_path):
     (tmp_path / "thesis.txt").write_text("mine")
     with pytest.raises(OSError, match="other files in it"):
