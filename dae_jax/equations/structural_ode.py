@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -397,30 +398,31 @@ def _nearest(ode: StructuralODE, t: Time, known: Float[Array, " N"], weights: Fl
         a, h = ode.normals(t, y), ode.violations(t, y)
         return aim + step_to(a, h + jnp.sum(a * (aim - y), 1), weights, ~is_value)
 
-    def iterate(params: PyTree) -> Any:
+    def settled(y: Float[Array, " N"], aims: Callable[[Array], Array], params: PyTree) -> Any:
         def correct(y: Float[Array, " N"]) -> Any:
-            new = moved(y, y, params)
+            new = moved(y, aims(y), params)
             return new, relative_change(new - y, y)
 
-        # The nearest point, then what `cut` has left of H there.
-        return fixed_point(correct, params[4], max_steps=STARTING)
+        return fixed_point(correct, y, max_steps=STARTING)
 
     given = ode, t, known, weights
-    measured = is_value & (weights > 0)
-    scale = jnp.where(measured, 1 / jnp.where(measured, weights, 1), 0)
-    # Derivatives have nothing to be near to but what the equations make of them; a little of a pull keeps those that the
-    # equations leave open from being undetermined.
+    held = jax.tree.map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, given)
+    start, measured = held[2], is_value & (weights > 0)
+    # Derivatives have nothing to be near to but what the equations make of them.
+    aims = lambda y: jnp.where(is_value, start, y)
+    if ode.sparse is not None:
+        # Solved in parts as small as round-off, a large linearisation does not say how far off a point is.
+        first, _ = settled(start, aims, held)
+    else:
+        scale = jnp.where(measured, 1 / jnp.where(measured, weights, 1), 0)
+        inner = lambda a, b: jnp.sum(scale * a * scale * b)
+        first = nearest_point(lambda y, aim: moved(y, aim, held), start, aims, inner, measured)
+    params = (*given, first)
+    # A little of a pull keeps the derivatives that the equations leave open from being undetermined.
     pull = jnp.finfo(known.dtype).eps ** 0.6
     aim = lambda y, params: jnp.where(is_value, params[2], y - pull * (y - params[4]))
-    held = jax.tree.map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, given)
-    first = nearest_point(
-        lambda y, aim: moved(y, aim, held),
-        held[2],
-        lambda y: jnp.where(is_value, held[2], y),
-        lambda a, b: jnp.sum(scale * a * scale * b),
-        measured,
-    )
-    params = (*given, first)
+    # From the nearest point on, what `cut` has left of H there.
+    iterate = lambda params: settled(params[4], lambda y: y, params)
     return implicit_root(
         lambda y, p: y - moved(y, aim(y, p), p), iterate, params, jacobian=_by_y if ode.sparse else None
     )[0]
