@@ -360,32 +360,35 @@ class StructuralODE(ManifoldODE):
         """Y of a state: the derivatives of order 1 and higher are those with which the equations hold, or nearly hold."""
         values = self.form.encode(state)
         guess = rates_of(self.form, t, values)[0] if is_nonlinear(self.form, values.dtype) else None
-        return self.start(t, values, jnp.zeros(self.form.size), guess=guess)
+        return self.start(t, values, None, guess=guess)
 
     def start(
         self,
         t: Time,
         values: Float[Array, " n"],
-        freedom: Float[Array, " n"],
+        freedom: Float[Array, " n"] | None,
         rates: Float[Array, " n"] | None = None,
         guess: Float[Array, " n"] | None = None,
     ) -> Float[Array, " N"]:
         """Y near the values of the variables, each of which may move as much as its `freedom` says (0: not at all; 1: no
-        more than the others), with the least H. Gauss–Newton's method, the derivatives from 0 or, the first ones, from
+        more than the others; `None`: none moves), with the least H. Gauss–Newton's method, the derivatives from 0 or, the first ones, from
         `guess`; these are `rates` where that is given.
         """
         index = self.orders.values
-        weights = take(freedom.astype(values.dtype), index) + jnp.asarray(np.where(index < 0, FREE, 0), values.dtype)
+        weights = jnp.asarray(np.where(index < 0, FREE, 0), values.dtype)
+        weights = weights if freedom is None else weights + take(freedom.astype(values.dtype), index)
         known = take(values, index)
         first = self.orders.first_derivatives
         guess = self.form.known_rates(values) if guess is None else guess
         known = known + take(guess if rates is None else rates, first)
         if rates is not None:
             weights = jnp.where(first < 0, weights, 0)
-        return _nearest(self, t, known, weights)
+        return _nearest(self, t, known, weights, freedom is not None)
 
 
-def _nearest(ode: StructuralODE, t: Time, known: Float[Array, " N"], weights: Float[Array, " N"]) -> Any:
+def _nearest(
+    ode: StructuralODE, t: Time, known: Float[Array, " N"], weights: Float[Array, " N"], values_move: bool
+) -> Any:
     if not any(ode.orders.equations):
         return known
     is_value = ode.orders.values >= 0
@@ -410,7 +413,9 @@ def _nearest(ode: StructuralODE, t: Time, known: Float[Array, " N"], weights: Fl
     start, measured = held[2], is_value & (weights > 0)
     # Derivatives have nothing to be near to but what the equations make of them.
     aims = lambda y: jnp.where(is_value, start, y)
-    if ode.sparse is not None:
+    if not values_move:
+        first = start
+    elif ode.sparse is not None:
         # Solved in parts as small as round-off, a large linearisation does not say how far off a point is.
         first, _ = settled(start, aims, held)
     else:
