@@ -17,7 +17,7 @@ from ..compiler import one_kernel
 from ..compiler.types import Arrays
 from ..consistent import consistent_state
 from ..equations.constraint_jacobian import Rank
-from ..equations.structural_ode import underlying_ode
+from ..equations.flow import flow
 from ..solution import RESULTS, DAESolution, precision_of
 from ..systems import System
 from ..types import Args, Scalar, State, Time, Y
@@ -270,9 +270,9 @@ def _level_at_start(
     """
     value = jnp.asarray(condition(t, y, args))
     # The state as it is: one made anew from the underlying ODE is NaN where the structure allows what the numbers do not.
-    z, ode = underlying_ode(system, t, y, args, rank)
-    of = lambda t, z: jnp.asarray(condition(t, ode.decode(t, z), args), t.dtype)
-    _, rate = jax.jvp(of, (t, z), (jnp.ones_like(t), ode.field(t, z)))
+    z, decode, zd = flow(system, t, y, args, rank)
+    of = lambda t, z: jnp.asarray(condition(t, decode(t, z), args), t.dtype)
+    _, rate = jax.jvp(of, (t, z), (jnp.ones_like(t), zd))
     rate = jnp.where(jnp.isfinite(rate), sign * rate, -before)
     slopes = jax.tree.leaves(jax.grad(of, 1)(t, z))
     terms = sum(jnp.sum(jnp.abs(slope * x)) for slope, x in zip(slopes, jax.tree.leaves(z), strict=True))

@@ -163,3 +163,20 @@ def test_the_nearest_consistent_state_of_a_large_system():
     np.testing.assert_allclose(found["v"], nearest, atol=1e-8)
     with pytest.raises(NotImplementedError, match="up to 256 unknowns"):
         jax.grad(lambda v: dae_jax.consistent_state(PUSHED, 0.0, {"v": v, "p": y0["p"]}, FORCE)["v"].sum())(off["v"])
+
+
+def test_a_reset_of_a_large_system():
+    """From a condition that is 0 at the start: on which side it then is the rate says, of an algebraic variable here."""
+    n, rates = 150, jnp.linspace(1.0, 2.0, 150)
+    system = dae_jax.SemiExplicitDAE(lambda t, x, z, a: z, lambda t, x, z, a: z + rates * x)
+    condition = lambda t, y, a, **_: (y[1][0] + 1) * (y[1][0] + 0.5)
+    kicked = dae_jax.Reset(condition, lambda t, y, a: ((y[0].at[1].add(1.0), y[1]), a), fixed=(True, False))
+    start = (jnp.ones(n), -rates)
+    sol = dae_jax.daesolve(system, dae_jax.BDF(), 0.0, 1.0, None, start, event=kicked)
+    assert sol.stats["jumps"] == 1
+    assert sol.stats["jump_times"][0] == pytest.approx(np.log(2), abs=1e-5)
+    x, z = sol.final
+    exact = np.exp(-np.asarray(rates))
+    exact[1] += np.exp(-rates[1] * (1 - np.log(2)))
+    np.testing.assert_allclose(x, exact, atol=1e-5)
+    np.testing.assert_allclose(z, -rates * exact, atol=2e-5)

@@ -39,7 +39,10 @@ def are_known(x: np.ndarray) -> bool:
 
 def as_indices(x: np.ndarray) -> np.ndarray:
     """Known entries as integers of 64 bits; what is too large for one is the largest."""
-    return np.array([min(int(i), np.iinfo(np.int64).max) for i in x.ravel()], np.int64).reshape(x.shape)
+    values = np.array(list(x.ravel())) if x.size else np.zeros(0, np.int64)
+    if values.dtype == np.uint64:
+        values = np.minimum(values, np.uint64(np.iinfo(np.int64).max))
+    return values.astype(np.int64).reshape(x.shape)
 
 
 def columns(x: np.ndarray, axes: tuple[int, ...]) -> np.ndarray:

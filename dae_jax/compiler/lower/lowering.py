@@ -8,8 +8,8 @@ from jax.typing import ArrayLike
 
 from ..emit.target import Target
 from ..jaxprs.inline import Inlining
-from ..jaxprs.numbers import on_numbers
-from ..jaxprs.objects import is_number, objects
+from ..jaxprs.numbers import is_on_numbers
+from ..jaxprs.objects import are_known, objects
 from ..thresholds import THRESHOLDS
 from ..types import Aval, Equation
 from . import rules as rules
@@ -128,10 +128,6 @@ def _check(eqn: Equation, out: list[Operand]) -> None:
 
 def _stays_known(rule: Rule, eqn: Equation, args: list[Operand]) -> bool:
     """Whether all operands are numbers, and the results are then too, without an instruction."""
-    known = [a for a in args if isinstance(a, np.ndarray) and all(map(is_number, a.ravel()))]
-    if len(known) < len(args):
+    if not (rule.moves or is_on_numbers(eqn)):
         return False
-    if rule.moves:
-        return True
-    values = [np.array(list(a.ravel()), v.aval.dtype).reshape(a.shape) for a, v in zip(known, eqn.invars, strict=True)]
-    return on_numbers(eqn, values) is not None
+    return all(isinstance(a, np.ndarray) and are_known(a) for a in args)

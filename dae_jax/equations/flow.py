@@ -1,0 +1,38 @@
+"""Where a state moves: the derivatives of all its variables, those that occur in no equation among them."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from ..systems import System, is_mechanism
+from ..types import Args, State, Time, Y
+from .constraint_jacobian import Rank
+from .linearised import LinearisedResidual
+from .residual_form import LARGE, ResidualForm
+from .structural_ode import underlying_ode
+
+
+def flow(
+    system: System, t: Time, state: State, args: Args, rank: int | Rank | None
+) -> tuple[Y, Callable[[Time, Y], State], Y]:
+    """y, what makes a state of one, and ẏ at a consistent state.
+
+    ẏ is that of the underlying ODE. Of a large system that would be dense, and ẏ is (y₁ − y)/h after one short step of the
+    implicit Euler method, (J + M/h)(y₁ − y) = M ẏ₀ − F(t + h, y, ẏ₀), which gives algebraic variables of index 1 theirs
+    also; NaN where it has hidden equations.
+    """
+    if is_mechanism(system) or sum(jnp.size(x) for x in jax.tree.leaves(state)) <= LARGE:
+        y, ode = underlying_ode(system, t, state, args, rank)
+        return y, ode.decode, ode.field(t, y)
+    form = ResidualForm.of(system, t, state, args)
+    y: Any = form.encode(state)
+    linearised = LinearisedResidual.of(form, y)
+    if linearised.structure.hidden:
+        return y, form.decode, jnp.full_like(y, jnp.nan)
+    h = jnp.finfo(y.dtype).eps ** 0.5 * jnp.maximum(jnp.abs(t), 1)
+    yd = linearised.rates(t, y)
+    j, m = linearised.jacobians(t, y, yd)
+    off = linearised.storage.apply(m, yd) - linearised.residual(t + h, y, yd)
+    return y, form.decode, linearised.solve(linearised.factor(j, m, 1 / h, h), off) / h
