@@ -52,12 +52,14 @@ def nearest_point(
     def step(carry: Any) -> Any:
         y, way, merit, left, arrived, part, count = carry
         off = jnp.max(jnp.abs(jnp.where(movable, way, 0)), initial=0)
-        aside = jnp.where((count == 1) & movable & (off > roundoff(y.dtype) ** 0.5), ASIDE * off * directions, 0)
+        # In units of its own, where an entry has any.
+        reach = jnp.where(y == 0, off, jnp.minimum(jnp.abs(y), off))
+        aside = jnp.where((count == 1) & movable & (off > roundoff(y.dtype) ** 0.5), ASIDE * reach * directions, 0)
         trial = y + part * way + aside
         new = look(trial, left, arrived)
         # Near the end differences of the merit are round-off, and ways get shorter.
         level = (new[1] - merit <= jnp.sqrt(roundoff(y.dtype)) * merit) & (size(new[0], trial) <= size(way, y))
-        better = (new[1] <= merit) | level | ~arrived
+        better = jnp.isfinite(new[1]) & ((new[1] <= merit) | level | ~arrived)
         moved, turned = trial - y, way - new[0]
         inverse = inner(moved, moved) / inner(moved, turned)
         longer = jnp.where((inverse > 0) & arrived, jnp.minimum(inverse, 1), 1)
