@@ -170,7 +170,8 @@ def consistent_state(
         said, instead = "The initial state `y0` violates", "No consistent state was found near `y0`; left over are"
         raise ValueError(
             remains.message().replace(said, instead).replace(", whatever its derivatives", "")
-            + "\nThe equations may contradict each other, or too many entries are fixed."
+            + "\nThe equations may contradict each other, too many entries may be fixed, or their derivatives vanish at `y0`, as at "
+            "the centre of a circle: begin elsewhere then."
         )
     return found
 

@@ -82,6 +82,22 @@ def test_far_from_what_is_curved(kind, x):
 
 
 @pytest.mark.parametrize("kind", list(ON_ELLIPSE))
+def test_a_start_without_a_way_to_go_is_named(kind):
+    with pytest.raises(ValueError, match="derivatives vanish at `y0`"):
+        nearest_on_ellipse(kind, jnp.zeros(2))
+
+
+def test_units_of_their_own():
+    """A pressure that is off by 50,000 does not push a fraction, whose logarithm is taken, below zero."""
+    off = lambda t, x, z, a: jnp.stack([z[0] - 1e5 * (1 + x[0]), jnp.log(z[1]) + 2e-5 * z[0] - x[0], z[2] - z[1] ** 2])
+    system = dae_jax.SemiExplicitDAE(lambda t, x, z, a: -x, off)
+    fraction = np.exp(0.5 - 3)
+    for start in ([2e5, 0.1, 0.0], [0.0, 0.5, 0.1], [3e5, 1e-6, 0.0]):
+        _, z = dae_jax.consistent_state(system, 0.0, (jnp.array([0.5]), jnp.array(start)), fixed=(True, False))
+        np.testing.assert_allclose(z, [1.5e5, fraction, fraction**2], rtol=1e-13)
+
+
+@pytest.mark.parametrize("kind", list(ON_ELLIPSE))
 def test_derivative_far_from_what_is_curved(kind):
     x, step = jnp.array([4.0, 0.3]), 1e-5
     of_x = lambda x: nearest_on_ellipse(kind, x)
