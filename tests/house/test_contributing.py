@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+from tests.break_formulas import BREAKS
 from tests.house.test_layers import FLOORS
 
 
@@ -15,6 +16,12 @@ def test_the_way_of_y0_names_what_is_there():
     assert len(found) >= 8
     for path, name in found:
         assert re.search(rf"^\s*(def|class) {name}\b", (ROOT / path).read_text(), re.MULTILINE), (path, name)
+
+
+def test_formulas_to_break_stand_where_they_are_looked_for():
+    """Each once: a formula that has changed since would no longer be broken by `tests/break_formulas.py`."""
+    for name, formula in BREAKS.items():
+        assert (ROOT / "dae_jax" / formula.path).read_text().count(formula.old) == 1, name
 
 
 def test_files_that_are_named_exist():
