@@ -193,8 +193,7 @@ def _nearest_of_any(system: System, t: Time, y0: State, args: Args, masks: State
     t = jnp.asarray(t, values.dtype)
     ode = StructuralODE.of(form, values.dtype, complete=True)
     freedom = jnp.where(form.encode(masks), 0, 1)
-    near = rates_of(form, t, values)[0] if rates is None and is_nonlinear(form, values.dtype) else None
-    y = ode.start(t, values, freedom, None if rates is None else form.encode(rates), near)
+    y = ode.start(t, values, freedom, None if rates is None else form.encode(rates))
     remains = _left_over(ode, t, y)
     fine = remains.consistent()
     return jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), ode.decode(t, y)), fine, remains

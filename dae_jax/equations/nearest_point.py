@@ -54,11 +54,11 @@ def nearest_point(
         off = jnp.max(jnp.abs(jnp.where(movable, way, 0)), initial=0)
         # In units of its own, where an entry has any.
         reach = jnp.where(y == 0, off, jnp.minimum(jnp.abs(y), off))
-        aside = jnp.where((count == 1) & movable & (off > roundoff(y.dtype) ** 0.5), ASIDE * reach * directions, 0)
+        aside = jnp.where((count == 1) & movable & (off > noise), ASIDE * reach * directions, 0)
         trial = y + part * way + aside
         new = look(trial, left, arrived)
         # Near the end differences of the merit are round-off, and ways get shorter.
-        level = (new[1] - merit <= jnp.sqrt(roundoff(y.dtype)) * merit) & (size(new[0], trial) <= size(way, y))
+        level = (new[1] - merit <= noise * merit) & (size(new[0], trial) <= size(way, y))
         better = jnp.isfinite(new[1]) & ((new[1] <= merit) | level | ~arrived)
         moved, turned = trial - y, way - new[0]
         inverse = inner(moved, moved) / inner(moved, turned)
@@ -70,7 +70,7 @@ def nearest_point(
         y, way, _, _, _, part, count = carry
         return (count == 0) | (size(way, y) > roundoff(y.dtype)) & (part > SHORTEST) & (count < STEPS)
 
-    size = relative_change
+    size, noise = relative_change, roundoff(start.dtype) ** 0.5
     directions = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, start.shape), start.dtype)
     one = jnp.ones((), start.dtype)
     first = start, jnp.zeros_like(start), one * jnp.inf, 0 * one, jnp.asarray(False), one, 0

@@ -40,7 +40,7 @@ def equation_drift(system: System, t: Time, state: State, args: Args) -> tuple[F
     ode = StructuralODE.of(form, y.dtype, complete=True)
     if ode.sparse is not None:
         # All levels at once: the derivatives with which they are least together.
-        return tuple(jnp.max(jnp.abs(level)) for level in ode.invariants(t, ode.start(t, y, jnp.zeros_like(y))))
+        return tuple(jnp.max(jnp.abs(level)) for level in ode.invariants(t, ode.start(t, y, None)))
     return tuple(jnp.max(jnp.abs(level)) for level in ode.invariants(t, _with_derivatives(ode, t, y)))
 
 

@@ -358,9 +358,7 @@ class StructuralODE(ManifoldODE):
 
     def encode(self, t: Time, state: State) -> Float[Array, " N"]:
         """Y of a state: the derivatives of order 1 and higher are those with which the equations hold, or nearly hold."""
-        values = self.form.encode(state)
-        guess = rates_of(self.form, t, values)[0] if is_nonlinear(self.form, values.dtype) else None
-        return self.start(t, values, None, guess=guess)
+        return self.start(t, self.form.encode(state), None)
 
     def start(
         self,
@@ -368,21 +366,23 @@ class StructuralODE(ManifoldODE):
         values: Float[Array, " n"],
         freedom: Float[Array, " n"] | None,
         rates: Float[Array, " n"] | None = None,
-        guess: Float[Array, " n"] | None = None,
     ) -> Float[Array, " N"]:
         """Y near the values of the variables, each of which may move as much as its `freedom` says (0: not at all; 1: no
-        more than the others; `None`: none moves), with the least H. Gauss–Newton's method, the derivatives from 0 or, the first ones, from
-        `guess`; these are `rates` where that is given.
+        more than the others; `None`: none moves), with the least H. Gauss–Newton's method; the derivatives from 0, the first ones from what
+        is known of them or, where F is nonlinear in them, from such as satisfy it; these are `rates` where that is given.
         """
         index = self.orders.values
         weights = jnp.asarray(np.where(index < 0, FREE, 0), values.dtype)
         weights = weights if freedom is None else weights + take(freedom.astype(values.dtype), index)
         known = take(values, index)
         first = self.orders.first_derivatives
-        guess = self.form.known_rates(values) if guess is None else guess
-        known = known + take(guess if rates is None else rates, first)
         if rates is not None:
             weights = jnp.where(first < 0, weights, 0)
+        elif is_nonlinear(self.form, values.dtype):
+            rates = rates_of(self.form, t, values)[0]
+        else:
+            rates = self.form.known_rates(values)
+        known = known + take(rates, first)
         return _nearest(self, t, known, weights, freedom is not None)
 
 

@@ -138,13 +138,9 @@ class _Reader:
     def _refuse_field(self, kind: str, field: str) -> None:
         """What is set (0 and −1 are nothing) of a field that is not known."""
         rows = np.asarray(getattr(self.model, field))
-        if (
-            rows.size == 0
-            or rows.ndim == 0
-            or (field == "dof_frictionloss" and self._disabled("FRICTIONLOSS", "CONSTRAINT"))
-        ):
+        if rows.ndim == 0 or (field == "dof_frictionloss" and self._disabled("FRICTIONLOSS", "CONSTRAINT")):
             return
-        owners = np.flatnonzero(((rows != 0) & (rows != -1)).reshape(len(rows), -1).any(1))
+        owners = np.flatnonzero(((rows != 0) & (rows != -1)).any(tuple(range(1, rows.ndim))))
         if kind == "dof":
             owners = np.unique(self.model.dof_jntid[owners])
         for k in owners:

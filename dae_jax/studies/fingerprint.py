@@ -28,14 +28,16 @@ def fingerprint(fn: Callable[..., PyTree], one: PyTree, elements: PyTree, chunk:
     constants = [x for jaxpr in (closed, *inner) if isinstance(jaxpr, ClosedJaxpr) for x in jaxpr.consts]
     # What Python computes while the program runs stands in the jaxpr as an address.
     called = [eqn.params["callback"] for eqn in eqns if "callback" in eqn.params]
-    for part in _parts([called, constants, jax.tree.leaves(elements)], set()):
+    for part in _parts([called, constants, jax.tree.leaves(elements)], {}):
         found.update(part)
     found.update(f"{chunk} {jax.__version__} {jnp.zeros(()).dtype}".encode())
     return found.hexdigest()
 
 
-def _parts(x: Any, seen: set[int]) -> Iterator[bytes]:
-    """The numbers of arrays, the code of functions and what they close over, of other things what they print."""
+def _parts(x: Any, seen: dict[int, object]) -> Iterator[bytes]:
+    """The numbers of arrays, the code of functions and what they close over, the fields of objects, of other things what they
+    print. `seen` keeps what it names by its address: another thing could have it later.
+    """
     if isinstance(x, np.ndarray | np.generic | jax.Array):
         if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
             x = jax.random.key_data(x)
@@ -44,14 +46,20 @@ def _parts(x: Any, seen: set[int]) -> Iterator[bytes]:
     elif id(x) in seen:
         return
     elif isinstance(x, list | tuple | dict):
-        seen.add(id(x))
+        seen[id(x)] = x
+        yield f"{type(x).__name__}{len(x)}".encode()
         for item in x.items() if isinstance(x, dict) else x:
             yield from _parts(item, seen)
+    elif isinstance(x, set | frozenset):
+        # Their order is another one in each process.
+        yield repr(sorted(ADDRESS.sub("", repr(item)) for item in x)).encode()
     elif isinstance(x, types.CodeType):
         yield x.co_code
         yield from _parts((x.co_names, x.co_consts), seen)
+    elif isinstance(x, types.MethodType):
+        yield from _parts((x.__func__, x.__self__), seen)
     elif isinstance(x, types.FunctionType):
-        seen.add(id(x))
+        seen[id(x)] = x
         cells = [cell.cell_contents for cell in x.__closure__ or ()]
         yield from _parts((x.__code__, x.__defaults__ or (), x.__kwdefaults__ or {}, cells), seen)
     elif isinstance(x, functools.partial):
@@ -60,5 +68,9 @@ def _parts(x: Any, seen: set[int]) -> Iterator[bytes]:
         yield from _parts(x.callback_func, seen)
     elif isinstance(getattr(x, "__wrapped__", None), types.FunctionType):
         yield from _parts(x.__wrapped__, seen)
+    elif hasattr(x, "__dict__") and not isinstance(x, type | types.ModuleType):
+        seen[id(x)] = x
+        yield repr(type(x)).encode()
+        yield from _parts((vars(type(x)).get("__call__"), vars(x)), seen)
     else:
         yield ADDRESS.sub("", repr(x)).encode()

@@ -83,7 +83,7 @@ class Store(Memory):
             # What others wrote is in the same files once they are there.
             multihost_utils.sync_global_devices("dae_jax.sweep end")
         # Copied when written to: the results are the caller's, the files the sweep's.
-        return [*(np.memmap(x.filename, x.dtype, "c", x.offset, x.shape) for x in self.arrays if x.filename)]
+        return [*(np.memmap(str(x.filename), x.dtype, "c", x.offset, x.shape) for x in self.arrays)]
 
 
 def _create(folder: Path, shapes: list[tuple[str, Any, Any]], fingerprint: str) -> None:

@@ -19,6 +19,7 @@ import dae_jax
 from dae_jax import reductions
 from dae_jax.scenes import SCENES
 from dae_jax.studies import sweep as sweep_file
+from dae_jax.studies.fingerprint import fingerprint
 
 
 PENDULUM = SCENES["pendulum"]()
@@ -127,6 +128,40 @@ def test_what_python_computes_counts(tmp_path, factor):
     np.testing.assert_array_equal(of(factor), first)
     with pytest.raises(ValueError, match="holds another sweep"):
         of(factor + 1)
+
+
+class Scaled:
+    def __init__(self, factor):
+        self.factor = factor
+
+    def by(self, x):
+        return np.asarray(x * self.factor * len({"a", "b"}))
+
+    def half(self, x):
+        return np.asarray(x / len({"a", "b"}))
+
+
+def test_what_helpers_and_methods_compute_counts():
+    """However deep they are closed over; and always with the same fingerprint."""
+
+    def of(host):
+        call = lambda x: jax.pure_callback(host, jax.ShapeDtypeStruct((), float), x)
+        return fingerprint(call, jax.ShapeDtypeStruct((), float), np.arange(3.0), 2)
+
+    def through(last):
+        def inner(x):
+            return [x, 2 * x][0]
+
+        def outer(x):
+            return last(inner(x))
+
+        return outer
+
+    hosts = [through(lambda x, n=n: x + n) for n in (1, 2)] + [through(lambda x: x - 1)]
+    hosts += [Scaled(2).by, Scaled(3).by, Scaled(2).half]
+    found = [of(host) for host in hosts]
+    assert len(set(found)) == len(hosts)
+    assert [of(host) for host in hosts] == found
 
 
 def test_what_is_written_into_the_results_stays_out_of_the_store(tmp_path):
