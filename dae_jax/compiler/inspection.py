@@ -10,6 +10,7 @@ from .emit.target import host
 from .jaxprs.scalar_interpreter import Unsupported
 from .jaxprs.walk import equations
 from .kernel_call import decision
+from .settings import current
 
 
 _WORDS = {
@@ -61,7 +62,7 @@ class Lowered:
     def assembly(self) -> str:
         """The machine code in words. Errors: as `ir`."""
         found: dict[str, str] = {}
-        object_code(self.ir(), host(), show=found.__setitem__)
+        object_code(self.ir(), host(), current().optimise, show=found.__setitem__)
         return found["s"]
 
     def __repr__(self) -> str:

@@ -28,6 +28,7 @@ class Settings:
     check: int = 0
     dump: str | None = None
     isa: str | None = None
+    optimise: bool = True
 
 
 # Part of the key of JAX's caches: what was compiled with other settings is compiled again.
@@ -63,15 +64,14 @@ def _from_environment() -> Settings:
 
 
 def read(environment: Mapping[str, str]) -> tuple[Settings, int | None]:
-    """The settings that the variables DAE_JAX_COMPILER, _CHECK, _DUMP, _ISA and _THREADS ask for.
+    """The settings that the variables DAE_JAX_COMPILER, _CHECK, _DUMP, _ISA, _OPTIMISE and _THREADS ask for.
 
     Errors: `ValueError` for a value that none of them takes.
     """
-    given = {
-        field: environment.get(f"DAE_JAX_{field.upper()}") for field in ("compiler", "check", "dump", "isa", "threads")
-    }
+    fields = ("compiler", "check", "dump", "isa", "optimise", "threads")
+    given = {field: environment.get(f"DAE_JAX_{field.upper()}") for field in fields}
     numbers: dict[str, Any] = {}
-    for field in ("check", "threads"):
+    for field in ("check", "optimise", "threads"):
         text = given.pop(field)
         if text:
             if not text.strip().isdecimal():
@@ -80,6 +80,8 @@ def read(environment: Mapping[str, str]) -> tuple[Settings, int | None]:
     values: dict[str, Any] = {field: text for field, text in given.items() if text}
     if "check" in numbers:
         values["check"] = _units(numbers["check"])
+    if "optimise" in numbers:
+        values["optimise"] = _switch(numbers["optimise"], "DAE_JAX_OPTIMISE")
     threads = _count(numbers["threads"], "DAE_JAX_THREADS") if "threads" in numbers else None
     return _checked(Settings(), values, lambda field: f"DAE_JAX_{field.upper()}"), threads
 
@@ -92,6 +94,7 @@ def configure(
     dump: str | os.PathLike[str] | None = None,
     threads: int | None = None,
     isa: str | None = None,
+    optimise: bool | None = None,
     process_wide: bool = False,
 ) -> contextlib.ExitStack:
     """Settings of the compilation, at once; used in a `with` statement, until its end.
@@ -107,6 +110,8 @@ def configure(
     - `dump`: a folder for what is compiled: the jaxpr, LLVM's intermediate representation before and after its passes, assembly.
     - `threads`: at most so many for a batch, and no more than the processors that the process may use; in the whole process.
     - `isa`: `"sse2"`, `"avx2"` or `"avx512"` for less than what this machine has.
+    - `optimise`: `False` for machine code that is ready in a tenth of the time, without LLVM's passes, and takes two to four times
+      as long: for tests, and where each solve runs a few times. Results differ by rounding.
     - `process_wide`: for programs that solve many small problems. Every small loop of the process is compiled to one kernel,
       also those of other libraries, and a computation runs in the thread that calls it, which saves the 10 to 50 µs of handing
       it to another. Call it before JAX computes anything.
@@ -115,6 +120,8 @@ def configure(
     process-wide setting.
     """
     values: dict[str, Any] = {"compiler": compiler, "isa": isa, "dump": None if dump is None else os.fspath(dump)}
+    if optimise is not None:
+        values["optimise"] = _switch(optimise, "`optimise`")
     if one_kernel is not None:
         if compiler is not None and (compiler == "off") == one_kernel:
             raise ValueError(f"`one_kernel={one_kernel}` contradicts `compiler={compiler!r}`: give one of them.")
@@ -141,6 +148,12 @@ def _units(check: object) -> int:
     if not isinstance(check, int) or check < 0:
         raise ValueError(f"`check` must be True, False or a number of units in the last place, but is {check!r}.")
     return check
+
+
+def _switch(value: object, name: str) -> bool:
+    if value not in (0, 1):
+        raise ValueError(f"{name} must be true or false, 1 or 0, but is {value!r}.")
+    return bool(value)
 
 
 def _count(threads: object, name: str) -> int:

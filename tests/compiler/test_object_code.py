@@ -122,12 +122,12 @@ class TestObjectCodeOnDisk:
         assert object_cache.load(file.stem) is None
 
     def test_what_the_key_depends_on(self, monkeypatch):
-        def key(text="text", passes=True):
-            return object_code.key(text, target.host(), passes)
+        def key(text="text", optimise=True):
+            return object_code.key(text, target.host(), optimise)
 
         first = key()
         assert key("other") != first
-        assert key(passes=False) != first
+        assert key(optimise=False) != first
         for owner, name, value in (
             (object_code, "SPEED", 3), (object_code, "TUNING", {}), (object_code, "HEAVY", 1),
             (object_code, "VERSION", (0, 4)), (object_code.importlib.metadata, "version", lambda _: "9.9"),

@@ -20,6 +20,7 @@ class TestSettings:
             ({"threads": "2"}, "`threads`"),
             ({"isa": "mmx"}, "`isa` must be one of sse2, avx2, avx512, but is 'mmx'"),
             ({"check": "yes"}, "`check`"),
+            ({"optimise": 2}, "`optimise` must be true or false, 1 or 0, but is 2"),
             ({"dump": "/proc/nowhere"}, "`dump` must be a folder"),
             ({"compiler": "llvm", "one_kernel": False}, "contradicts"),
         ],
@@ -35,6 +36,7 @@ class TestSettings:
             ({"DAE_JAX_THREADS": "many"}, "DAE_JAX_THREADS must be a whole number, but is 'many'"),
             ({"DAE_JAX_THREADS": "0"}, "at least 1"),
             ({"DAE_JAX_CHECK": "yes"}, "DAE_JAX_CHECK"),
+            ({"DAE_JAX_OPTIMISE": "3"}, "DAE_JAX_OPTIMISE must be true or false, 1 or 0, but is 3"),
             ({"DAE_JAX_ISA": "mmx"}, "DAE_JAX_ISA"),
         ],
     )
@@ -43,9 +45,10 @@ class TestSettings:
             read(given)
 
     def test_variables(self, tmp_path):
-        given = {"COMPILER": "xla", "CHECK": "1", "DUMP": str(tmp_path / "new"), "ISA": "avx2", "THREADS": "3"}
+        given = {"COMPILER": "xla", "CHECK": "1", "DUMP": str(tmp_path / "new"), "ISA": "avx2", "THREADS": "3", "OPTIMISE": "0"}
         settings, threads = read({f"DAE_JAX_{name}": value for name, value in given.items()})
-        assert (settings.compiler, settings.check, settings.isa, threads) == ("xla", 4096, "avx2", 3)
+        found = settings.compiler, settings.check, settings.isa, settings.optimise, threads
+        assert found == ("xla", 4096, "avx2", False, 3)
         assert (tmp_path / "new").is_dir()
         assert read({})[0].compiler == "llvm"
         assert read({"DAE_JAX_CHECK": "0"})[0].check == 0

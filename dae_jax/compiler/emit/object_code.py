@@ -38,15 +38,15 @@ _LOOP = "= phi i64 [ 0,"
 _TURNS = re.compile(r"icmp \w+ i64 %\S+, (\d+)")
 
 
-def key(text: str, target: Target, passes: bool) -> str:
-    """What object code depends on: the module, the target, the passes, and the versions of all that is involved."""
+def key(text: str, target: Target, optimise: bool) -> str:
+    """What object code depends on: the module, the target, the effort, and the versions of all that is involved."""
     versions = (importlib.metadata.version(name) for name in ("dae_jax", "llvmlite"))
     made = (
         *versions,
         llvm().llvm_version_info,
         VERSION,
         target,
-        passes,
+        optimise,
         SPEED,
         TUNING,
         HEAVY,
@@ -61,18 +61,18 @@ def key(text: str, target: Target, passes: bool) -> str:
 
 
 def object_code(
-    text: str, target: Target, passes: bool = True, show: Callable[[str, str], None] | None = None
+    text: str, target: Target, optimise: bool = True, show: Callable[[str, str], None] | None = None
 ) -> bytes:
-    """Machine code of a module; without `passes` it is made in the least time. `show` gets the intermediate representation after
+    """Machine code of a module; with `optimise=False` it is made in the least time. `show` gets the intermediate representation after
     the passes, and the assembly.
 
     Errors: `Unsupported` for a module that is broken.
     """
-    optimised = passes and _gains_by_passes(text)
-    machine = target.machine(3 if optimised else int(passes))
+    passes = optimise and _gains_by_passes(text)
+    machine = target.machine(3 if passes else int(optimise))
     try:
         module = parsed(text)
-        if optimised:
+        if passes:
             _optimise(module, machine)
     except RuntimeError as error:
         raise Unsupported(f"LLVM: {error}") from error

@@ -47,24 +47,24 @@ class _Program:
         return ctypes.c_int64.from_address(self.slot + 16).value
 
 
-def register(module: str, source: object = "") -> str:
+def register(module: str, source: object = None) -> str:
     """Compiles a module with a function `{name}.kernel`, and gives the name by which XLA calls it.
 
-    `source` is what the module was written from, for people to read.
+    `source` is what the module was written from, for people to read where the settings ask for a dump.
 
     `module` is a format string for `{name}`, which is made of its contents: equal programs are compiled once, also where
     XLA's compilation cache holds the program that calls them.
 
     Errors: `Unsupported` for a module that is broken.
     """
-    target = host()
-    name = "dae_jax_" + hashlib.sha256(f"{target} {module}".encode()).hexdigest()[:32]
+    target, optimise = host(), current().optimise
+    name = "dae_jax_" + hashlib.sha256(f"{target} {optimise} {module}".encode()).hexdigest()[:32]
     text = module.replace("{name}", name)
     with _lock:
-        if current().dump is not None:
+        if source is not None and current().dump is not None:
             _dump(text, target, name, source)
         if name not in _programs:
-            code = compiled(text, target)
+            code = compiled(text, target, optimise)
             slot, handler = _entrance()
             program = _Program(name, slot, handler, len(code), _spilled(code))
             _load(program, code)
@@ -89,12 +89,12 @@ def guarded(fn: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-def compiled(text: str, target: Target, passes: bool = True) -> bytes:
+def compiled(text: str, target: Target, optimise: bool = True) -> bytes:
     """Object code, from the cache on disk where that has it."""
-    made_of = key(text, target, passes)
+    made_of = key(text, target, optimise)
     code = object_cache.load(made_of)
     if code is None:
-        code = object_code(text, target, passes)
+        code = object_code(text, target, optimise)
         object_cache.keep(made_of, code)
     return code
 
@@ -107,7 +107,7 @@ def _dump(text: str, target: Target, name: str, source: object) -> None:
 
     show("jaxpr", str(source))
     show("ll", text)
-    object_code(text, target, show=show)
+    object_code(text, target, current().optimise, show=show)
 
 
 def engine(code: bytes, target: Target) -> Any:
@@ -123,7 +123,7 @@ class Runtime:
 
     def __init__(self) -> None:
         target = host()
-        self.engine = engine(compiled(shared(), target, passes=False), target)
+        self.engine = engine(compiled(shared(), target, optimise=False), target)
         address = self.engine.get_function_address
         for name in (HANDLE, SHARE):
             llvm().add_symbol(name, address(name))
@@ -138,7 +138,7 @@ class Runtime:
         ):
             ctypes.c_void_p.from_address(self.engine.get_global_value_address(name)).value = value
         os.register_at_fork(after_in_child=ctypes.CFUNCTYPE(None)(address("forked")))
-        self.stubs = compiled(stubs(), target, passes=False)
+        self.stubs = compiled(stubs(), target, optimise=False)
         self.entrances: list[tuple[int, Any]] = []
 
 
