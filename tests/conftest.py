@@ -5,6 +5,7 @@ import gc
 import os
 import subprocess
 import zlib
+from pathlib import Path
 
 
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -23,8 +24,15 @@ jax.config.update("jax_num_cpu_devices", 2)
 gc.set_threshold(100_000, 50, 50)
 
 
+SLOW = Path(__file__).with_name("slow.txt")
+# Tests that it names and that are not there, where all were looked for.
+GONE = pytest.StashKey[set[str]]()
+
+
 def pytest_addoption(parser):
-    parser.addoption("--slow", type=int, default=1, metavar="N", help="of the slow tests one in N, drawn by the commit; 1: all")
+    parser.addoption(
+        "--slow", type=int, default=1, metavar="N", help="of the slow tests one in N, drawn by the commit; 1: all"
+    )
 
 
 def pytest_report_header(config):
@@ -33,7 +41,12 @@ def pytest_report_header(config):
 
 
 def pytest_collection_modifyitems(config, items):
-    share = config.getoption("--slow")
+    slow, share = set(SLOW.read_text().splitlines()), config.getoption("--slow")
+    if config.args_source is pytest.Config.ArgsSource.TESTPATHS:
+        config.stash[GONE] = slow - {item.nodeid for item in items}
+    for item in items:
+        if item.nodeid in slow:
+            item.add_marker("slow")
     drawn = lambda item: zlib.crc32(f"{_commit()} {item.nodeid}".encode()) % share == 0
     left = [item for item in items if item.get_closest_marker("slow") and not drawn(item)]
     if left:

@@ -45,7 +45,14 @@ class TestSettings:
             read(given)
 
     def test_variables(self, tmp_path):
-        given = {"COMPILER": "xla", "CHECK": "1", "DUMP": str(tmp_path / "new"), "ISA": "avx2", "THREADS": "3", "OPTIMISE": "0"}
+        given = {
+            "COMPILER": "xla",
+            "CHECK": "1",
+            "DUMP": str(tmp_path / "new"),
+            "ISA": "avx2",
+            "THREADS": "3",
+            "OPTIMISE": "0",
+        }
         settings, threads = read({f"DAE_JAX_{name}": value for name, value in given.items()})
         found = settings.compiler, settings.check, settings.isa, settings.optimise, threads
         assert found == ("xla", 4096, "avx2", False, 3)

@@ -73,7 +73,6 @@ def test_derivatives_through_jumps():
     np.testing.assert_allclose(forward, exact, rtol=1e-6)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "order",
     [jax.hessian, lambda f: jax.grad(jax.grad(f)), lambda f: jax.jacfwd(jax.jacfwd(f))],

@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 from tests.break_formulas import BREAKS
+from tests.conftest import GONE
 from tests.house.test_layers import FLOORS
 
 
@@ -22,6 +23,11 @@ def test_formulas_to_break_stand_where_they_are_looked_for():
     """Each once: a formula that has changed since would no longer be broken by `tests/break_formulas.py`."""
     for name, formula in BREAKS.items():
         assert (ROOT / "dae_jax" / formula.path).read_text().count(formula.old) == 1, name
+
+
+def test_slow_tests_are_there(pytestconfig):
+    """Else `python -m tests.slow` writes the list anew."""
+    assert not pytestconfig.stash.get(GONE, set())
 
 
 def test_files_that_are_named_exist():

@@ -93,7 +93,6 @@ class TestErrors:
         exec(programs(ERRORS)[0], found)
         return found
 
-    @pytest.mark.slow
     def test_programs_end_in_their_codes(self, names):
         for name, section in SECTIONS.items():
             (program,) = programs(section)
@@ -139,7 +138,6 @@ class TestWhichMethod:
         assert row.count("|") == len(re.findall(r"\|", writer("which_method").HEAD)) + 1
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("page", ["coming_from", "which_method"])
 def test_programs_run(page):
     found = programs((NOTEBOOKS / f"{page}.md").read_text())

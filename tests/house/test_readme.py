@@ -3,13 +3,10 @@
 import re
 from pathlib import Path
 
-import pytest
-
 
 README = Path(__file__).parents[2] / "README.md"
 
 
-@pytest.mark.slow
 def test_the_readme_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     program = "\n".join(re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL))

@@ -36,7 +36,6 @@ def test_a_five_bar_with_a_motor_moves_as_in_minimal_coordinates():
     assert max(max(pair) for pair in drawn.links) < 14
 
 
-@pytest.mark.slow
 def test_a_stewart_platform_stays_closed_and_keeps_its_energy(monkeypatch):
     mechanism = m.stewart_platform()
     y0 = mechanism.assemble()

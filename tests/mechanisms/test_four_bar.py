@@ -113,21 +113,18 @@ def pull(crank):
     return mechanism.reaction(sol, "pivot")[0][-1, 0]
 
 
-@pytest.mark.slow
 def test_the_gradient_of_a_reaction_by_a_length_is_the_difference_quotient():
     h = 1e-5
     difference = (pull(jnp.asarray(CRANK + h)) - pull(jnp.asarray(CRANK - h))) / (2 * h)
     assert jax.grad(pull)(jnp.asarray(CRANK)) == pytest.approx(float(difference), rel=1e-6)
 
 
-@pytest.mark.slow
 def test_a_batch_of_designs_is_what_they_are_one_by_one():
     designs = jnp.linspace(0.9, 1.1, 3)
     one_by_one = jnp.stack([pull(x) for x in designs])
     assert np.allclose(jax.vmap(pull)(designs), one_by_one, rtol=1e-9)
 
 
-@pytest.mark.slow
 def test_the_linkage_in_space_moves_as_that_in_the_plane():
     """Accelerations and the forces of a joint at a moving state, where 3 of 23 equations in space are redundant."""
     planar, spatial = linkage(motor=False), linkage(spatial=True, motor=False)

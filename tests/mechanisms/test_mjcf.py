@@ -26,7 +26,6 @@ LOOP = """<mujoco><option gravity="0 0 -9.81"/><worldbody>
 <joint name="gear" joint1="a" joint2="c"/></equality><actuator><motor name="drive" joint="a"/></actuator></mujoco>"""
 
 
-@pytest.mark.slow
 def test_a_pendulum_moves_as_mujoco_moves_it():
     mechanism = m.read_mjcf(PENDULUM)
     times = np.linspace(0, 1, 11)
@@ -54,7 +53,6 @@ def test_a_pendulum_moves_as_mujoco_moves_it():
     assert off[1] / off[2] > 8
 
 
-@pytest.mark.slow
 def test_a_loop_is_closed_and_what_is_left_out_is_named():
     with pytest.warns(UserWarning, match=r"limits of 'a'; contacts of .*; actuators 'drive'"):
         mechanism = m.read_mjcf(LOOP)
@@ -151,7 +149,6 @@ class TestWelds:
         with pytest.raises(ValueError, match="weld 'w', whose relative pose"):
             m.read_mjcf(FREE_BODY.format(weld))
 
-    @pytest.mark.slow
     def test_without_a_torque_it_is_a_ball_joint(self):
         text = FREE_BODY.format('<weld body1="a" body2="b" torquescale="0"/>')
         mechanism = m.read_mjcf(text)

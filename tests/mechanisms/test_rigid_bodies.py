@@ -3,7 +3,6 @@
 import diffrax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from scipy.special import ellipj
 
 import dae_jax
@@ -50,7 +49,6 @@ def test_a_torque_free_top_turns_by_elliptic_functions():
     assert np.abs(momentum - momentum[0]).max() < 1e-9
 
 
-@pytest.mark.slow
 def test_a_heavy_symmetric_top_keeps_what_it_must():
     """Energy, and the moments of momentum about the vertical and about its own axis."""
     arm = np.array([0.0, 0.0, 0.5])

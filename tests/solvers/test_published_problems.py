@@ -13,7 +13,6 @@ from dae_jax.scenes import charge_pump, elastic_crank, wheelset
 PUMP = charge_pump()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("solver", "factor"),
     [(dae_jax.RadauIIA5(), 100), (dae_jax.BDF(), 20_000)],

@@ -33,7 +33,6 @@ def expected():
     return jnp.stack([(gradient(X + h * e) - gradient(X - h * e)) / (2 * h) for e in jnp.eye(2)])
 
 
-slow = pytest.mark.slow
 ORDERS = {
     "hessian": jax.hessian,
     "gradient of gradient": lambda f: jax.jacrev(jax.grad(f)),
@@ -50,11 +49,9 @@ METHODS = {
     "dummy derivatives": (diffrax.Tsit5(), dae_jax.DummyDerivatives()),
 }
 CASES = [
-    ("projection", "hessian"), pytest.param("explicit", "gradient of gradient", marks=slow),
-    pytest.param("explicit", "reverse over forward", marks=slow), pytest.param("Baumgarte", "hessian", marks=slow),
-    pytest.param("projection", "forward over forward", marks=slow),
-    pytest.param("tangent space", "gradient of gradient", marks=slow), pytest.param("Radau", "hessian", marks=slow),
-    pytest.param("BDF", "gradient of gradient", marks=slow), pytest.param("dummy derivatives", "forward over forward", marks=slow),
+    ("projection", "hessian"), ("explicit", "gradient of gradient"), ("explicit", "reverse over forward"), ("Baumgarte", "hessian"),
+    ("projection", "forward over forward"), ("tangent space", "gradient of gradient"), ("Radau", "hessian"),
+    ("BDF", "gradient of gradient"), ("dummy derivatives", "forward over forward"),
 ]  # fmt: skip
 
 
@@ -65,7 +62,6 @@ def test_are_differences_of_gradients(method, order, expected):
     np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
-@pytest.mark.slow
 def test_forward_mode_twice(expected):
     solver = dae_jax.OrthogonalProjection(diffrax.Tsit5())
     found = jax.jit(jax.jacfwd(jax.jacfwd(lambda x: loss(x, solver, adjoint=diffrax.ForwardMode()))))(X)

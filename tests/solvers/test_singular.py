@@ -177,10 +177,8 @@ class TestUnits:
     @pytest.mark.parametrize(
         ("solver", "form"),
         [
-            (dae_jax.RadauIIA5(), "GGL"),
-            pytest.param(dae_jax.RadauIIA5(), "index-2", marks=pytest.mark.slow),
-            pytest.param(dae_jax.RadauIIA5(), "index-3", marks=pytest.mark.slow),
-            *(pytest.param(dae_jax.BDF(), form, marks=pytest.mark.slow) for form in ("GGL", "index-2")),
+            *((dae_jax.RadauIIA5(), form) for form in ("GGL", "index-2", "index-3")),
+            *((dae_jax.BDF(), form) for form in ("GGL", "index-2")),
         ],
     )
     def test_make_no_difference(self, solver, form):
@@ -238,8 +236,8 @@ class TestSingularConfiguration:
         ("solver", "formulation"),
         [
             (dae_jax.TangentSpace(dae_jax.DOP853()), None),
-            pytest.param(dae_jax.DOP853(), dae_jax.DummyDerivatives(), marks=pytest.mark.slow),
-            pytest.param(dae_jax.RadauIIA5(), None, marks=pytest.mark.slow),
+            (dae_jax.DOP853(), dae_jax.DummyDerivatives()),
+            (dae_jax.RadauIIA5(), None),
         ],
     )
     def test_beyond_its_reach_a_linkage_ends_soon_and_in_words(self, solver, formulation):
