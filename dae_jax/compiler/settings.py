@@ -110,7 +110,7 @@ def configure(
     - `dump`: a folder for what is compiled: the jaxpr, LLVM's intermediate representation before and after its passes, assembly.
     - `threads`: at most so many for a batch, and no more than the processors that the process may use; in the whole process.
     - `isa`: `"sse2"`, `"avx2"` or `"avx512"` for less than what this machine has.
-    - `optimise`: `False` for machine code that is ready in a tenth of the time, without LLVM's passes, and takes two to four times
+    - `optimise`: `False` for machine code that is ready in a tenth of the time, without LLVM's passes, and takes three to five times
       as long: for tests, and where each solve runs a few times. Results differ by rounding.
     - `process_wide`: for programs that solve many small problems. Every small loop of the process is compiled to one kernel,
       also those of other libraries, and a computation runs in the thread that calls it, which saves the 10 to 50 µs of handing

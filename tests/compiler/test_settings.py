@@ -81,6 +81,16 @@ class TestSettings:
                 np.testing.assert_allclose(call(X), expected, rtol=1e-14)
         assert is_native(call, X)
 
+    def test_machine_code_that_is_ready_soon(self, tmp_path):
+        """The same function, compiled again: LLVM's passes leave it as it is written."""
+        call = jax.jit(one_kernel(numbered(450.0)[0], "forward"))
+        expected = call(X)
+        with configure(optimise=False, dump=tmp_path):
+            np.testing.assert_allclose(call(X), expected, rtol=1e-14)
+        (written,) = (f for f in tmp_path.iterdir() if f.name.partition(".")[2] == "ll")
+        count = lambda text: text.count("= getelementptr ")
+        assert count(written.with_suffix(".optimised.ll").read_text()) == count(written.read_text())
+
     def test_in_the_environment(self):
         program = "print('@dae_jax_' in jax.jit(one_kernel(loop, 'forward')).lower(1.5).as_text())"
         assert in_a_program(program, DAE_JAX_COMPILER="xla") == "False"
