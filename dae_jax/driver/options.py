@@ -74,11 +74,10 @@ def _refuse_bad_tolerances(controller: object) -> None:
     given = [controller.rtol, controller.atol]
     if all(type(x) is float and x > 0 for x in given) or any(isinstance(x, Tracer) for x in jax.tree.leaves(given)):
         return
-    leaves = jax.tree.leaves(given)
-    fine = all(isinstance(x, NUMBERS) and np.all(np.asarray(x) >= 0) for x in leaves)
-    if not fine or not any(np.any(np.asarray(x)) for x in leaves):
+    fine = all(isinstance(x, NUMBERS) and np.all(np.asarray(x) >= 0) for x in given)
+    if not fine or not any(np.any(np.asarray(x)) for x in given):
         raise ValueError(
-            "`stepsize_controller` must have positive tolerances, but has "
+            "`stepsize_controller` must have positive tolerances, numbers or arrays, but has "
             f"rtol = {brief(given[0])} and atol = {brief(given[1])}: write PIDController(rtol=1e-6, atol=1e-6)."
         )
 

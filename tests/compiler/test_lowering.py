@@ -14,6 +14,7 @@ from dae_jax.compiler.jaxprs.scalar_interpreter import Unsupported
 from dae_jax.compiler.lower import annotate, compiled, hindrances, unsupported, written
 from dae_jax.compiler.lower.lane_queue import main_loop
 from dae_jax.compiler.thresholds import THRESHOLDS
+from dae_jax.linalg.dense import solve
 
 
 X = np.array([1.0, 2.0, -3.0])
@@ -363,6 +364,28 @@ def test_what_is_used_once_takes_no_memory():
     line = lambda x: jnp.linspace(0, 1, 2000) * x[0]
     assert memory(lambda x: jnp.sum(jnp.exp(line(x)) * 3 + 1)) == 0
     assert 16_000 < memory(lambda x: jnp.sum(jnp.exp(line(x)) * line(x)[::-1] + 1)) < 17_000
+
+
+def stores(fn, *args):
+    return written(jax.make_jaxpr(fn)(*args)).count("\nstore ")
+
+
+def test_a_loop_reads_few_numbers_of_many_entries_through_strides():
+    """Masks of rows and a product of a column and a row, which an elimination has at each of its turns."""
+    for n in (8, 16):
+        assert stores(solve, np.eye(n), np.ones(n)) < 8 * n
+
+
+def test_entries_that_are_read_at_several_computed_places_are_stored_once():
+    def fn(x, i):
+        table = jnp.sin(x)[:, None] * jnp.cos(x)[None, :] + jnp.arange(36.0).reshape(6, 6)
+        picked = [table[i[0], i[1]], 2 * table[i[1], i[2]], jax.lax.cond(i[0] > 0, lambda: table[i[2], 0], lambda: 1.0)]
+        return table[0, 1], sum(picked)
+
+    x, i = np.arange(6.0), np.array([1, 3, 5])
+    assert stores(fn, x, i) < 36 + 6
+    for got, expected in zip(compiled(jax.make_jaxpr(fn)(x, i))(x, i), fn(x, i), strict=True):
+        np.testing.assert_allclose(got, expected, rtol=1e-14)
 
 
 def test_long_chains_of_operations_are_cut():

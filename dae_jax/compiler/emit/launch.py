@@ -99,7 +99,7 @@ def register(module: str, target: Target, first: int | None) -> str:
 
 def compiled(text: str, target: Target) -> str:
     """PTX, from the cache on disk where that has it."""
-    made_of = key(text, target, passes=True)
+    made_of = key(text, target, optimise=True)
     code = object_cache.load(made_of)
     if code is None:
         code = ptx(text, target).encode()

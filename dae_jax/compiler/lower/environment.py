@@ -9,9 +9,10 @@ from jax.extend.core import ClosedJaxpr, Literal, Var
 
 from ..thresholds import THRESHOLDS
 from ..types import Atom, aval_of
-from .arrays import Operand
+from .arrays import Fused, Operand, View
 from .context import Lowering
 from .operands import retain
+from .registry import RULES
 
 
 class Environment:
@@ -62,7 +63,21 @@ class Environment:
     def advance(self, start: int, stop: int) -> None:
         """Runs the equations from `start` to `stop`."""
         for i in range(start, stop):
-            self.give(i, self.lowering.equation(self.jaxpr.eqns[i], self.operands(i)))
+            self.give(i, self.lowering.equation(self.jaxpr.eqns[i], self.operands(i), self._goes_into_loop(i)))
+
+    def _goes_into_loop(self, i: int) -> bool:
+        """Whether equation i is read once, by an operation that goes through as many entries of an array in memory."""
+        result = self.jaxpr.eqns[i].outvars[0]
+        place = self._last.get(result, 0)
+        if self._uses[result] != 1 or place >= len(self.jaxpr.eqns):
+            return False
+        reader, few = self.jaxpr.eqns[place], self.lowering.memory.few
+        others = (self.values.get(v) for v in reader.invars if isinstance(v, Var))
+        return (
+            RULES[reader.primitive.name].fuses
+            and aval_of(reader.outvars[0]).shape == aval_of(result).shape
+            and any(isinstance(x, View | Fused) and x.size > few for x in others)
+        )
 
     def results(self) -> list[Any]:
         """What the jaxpr returns, when all of it has been run."""

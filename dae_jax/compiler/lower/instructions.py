@@ -7,7 +7,7 @@ that holds one number of each lane, or a single number that is the same for all.
 import contextlib
 import dataclasses
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -53,7 +53,7 @@ class Instructions:
         self.longest = 0
         self._count = 0
         # What has been written, by its text: in the function, and in each scope that is open.
-        self._known: list[dict[str, Value]] = [{}]
+        self._known: list[dict[Hashable, Any]] = [{}]
         self._scaled: dict[str, tuple[Value, float]] = {}
         # The names of floats whose sign bit is 0, also if they are NaN.
         self.without_sign: set[str] = set()
@@ -75,10 +75,14 @@ class Instructions:
 
     def pure(self, text: str, kind: str, lanes: bool) -> Value:
         """An instruction whose result its operands decide: written once."""
+        return self.once(text, lambda: self.write(text, kind, lanes))
+
+    def once(self, key: Hashable, make: Callable[[], Any]) -> Any:
+        """What `make` writes, where that has not been written in a scope that is open."""
         for known in self._known:
-            if text in known:
-                return known[text]
-        found = self._known[-1][text] = self.write(text, kind, lanes)
+            if key in known:
+                return known[key]
+        found = self._known[-1][key] = make()
         return found
 
     @contextlib.contextmanager

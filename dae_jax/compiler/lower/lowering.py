@@ -93,11 +93,11 @@ class Lowering:
             return self.memory.constant_view(x)
         return objects([x[i] for i in np.ndindex(x.shape)], x.shape)
 
-    def equation(self, eqn: Equation, args: list[Operand]) -> list[Any]:
-        """Writes an equation; gives its results."""
+    def equation(self, eqn: Equation, args: list[Operand], into_loop: bool = False) -> list[Any]:
+        """Writes an equation; gives its results. `into_loop`: what reads them is a loop over arrays in memory."""
         rule = RULES[eqn.primitive.name]
         try:
-            large = rule.nested or self._is_large(rule, eqn, args)
+            large = rule.nested or self._is_large(rule, eqn, args) or (into_loop and _is_broadcast(rule, eqn))
             args = args if large else list(map(self.memory.entries, args))
             out = rule.lower(Context(self, eqn, large), *args, **eqn.params)
             out = out if isinstance(out, list) else [out]
@@ -116,6 +116,12 @@ class Lowering:
         if largest > THRESHOLDS.folded or (largest > THRESHOLDS.in_registers and not _stays_known(rule, eqn, args)):
             return True
         return any(not isinstance(a, np.ndarray) and a.size > self.memory.few for a in args)
+
+
+def _is_broadcast(rule: Rule, eqn: Equation) -> bool:
+    """Whether the result has many entries of few operands, as an outer product: a loop reads these through strides."""
+    size = eqn.outvars[0].aval.size
+    return rule.fuses and size > THRESHOLDS.carried and size >= 2 * sum(v.aval.size for v in eqn.invars)
 
 
 def _check(eqn: Equation, out: list[Operand]) -> None:

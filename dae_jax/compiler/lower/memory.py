@@ -133,11 +133,24 @@ class Memory:
             if known.tobytes() != known.size * known.ravel()[:1].tobytes():
                 return self.constant_view(known)
             return dataclasses.replace(self.constant_view(known.ravel()[:1]), shape=x.shape, strides=(0,) * x.ndim)
-        out = self.new(dtype, x.shape)
+        if len(numbers) <= THRESHOLDS.carried:
+            return self._stored(x, dtype)
+        return self.code.once((dtype, x.shape, *map(id, numbers)), lambda: self._kept(x, dtype))[0]
+
+    def _kept(self, x: np.ndarray, dtype: DType) -> tuple[View, np.ndarray]:
+        """Entries in memory that stays as it is, and the entries, which are known by their place."""
+        out = self._stored(x, dtype)
+        out.buffer.references += 1
+        return out, x
+
+    def _stored(self, x: np.ndarray, dtype: DType) -> View:
+        once = _without_repeats(x)
+        out = self.new(dtype, once.shape)
         with self.code.unmasked():
-            for k, number in enumerate(numbers):
+            for k, number in enumerate(once.ravel()):
                 store(self.code, out.buffer, k, number)
-        return out
+        strides = tuple(s if n == m else 0 for s, n, m in zip(out.strides, once.shape, x.shape, strict=True))
+        return dataclasses.replace(out, shape=x.shape, strides=strides)
 
     def materialised(self, x: Operand) -> Any:
         """An array whose entries are known from here on."""
@@ -180,3 +193,12 @@ class Memory:
         else:
             few = x.size if isinstance(x, np.ndarray) else THRESHOLDS.per_turn
             for_each(self.code, x.shape, lambda index: put(self.at(to, index), self.entry(x, index)), few)
+
+
+def _without_repeats(x: np.ndarray) -> np.ndarray:
+    """Entries without those that a broadcast has repeated: of length 1 along an axis along which all are the same."""
+    for axis in (k for k, n in enumerate(x.shape) if n > 1):
+        first = x.take([0], axis)
+        if all(a is b for a, b in np.broadcast(x, first)):
+            x = first
+    return x
