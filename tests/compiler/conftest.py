@@ -1,11 +1,10 @@
-"""The compiler's tests run what users run: machine code after LLVM's passes."""
+"""The compiler's tests run what users run, in all threads: machine code after LLVM's passes."""
 
 import pytest
 
-from dae_jax import configure
+from dae_jax.compiler import settings
 
 
 @pytest.fixture(autouse=True)
-def _optimised():
-    with configure(optimise=True):
-        yield
+def _optimised(monkeypatch):
+    monkeypatch.setattr(settings, "_from_environment", settings.Settings)

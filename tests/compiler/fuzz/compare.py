@@ -12,7 +12,7 @@
 | complex products, quotients | Smith's quotient here | finite ones, divisors not 0, to 16 units |
 | `select_n` of a number out of range | the nearest case here | nothing |
 | windows of one `scatter` that overlap | the last one stays here | such as write the same |
-| derivatives | equal equations, rounded differently | to 64 units, and 256 of the largest result |
+| derivatives | equal equations, rounded differently; all may cancel | to 64 units, and 256 of the largest result or of 1/16 |
 """
 
 from typing import Any
@@ -20,11 +20,15 @@ from typing import Any
 import numpy as np
 
 
+# A derivative by operands of about 1 that cancels in every entry, as atan2's along (x, y) itself, is as far off as its terms are rounded.
+LEAST = 1 / 16
+
+
 def difference(found: Any, wanted: Any, ulps: float = 0, scale: float = 0) -> tuple[int, ...] | None:
     """Where the first array is not what the second says, nothing where it is.
 
     Integers and truth values must be the same, and floats of `ulps` and `scale` 0, with the sign of a zero. Other floats may be
-    `ulps` units in the last place off, and `scale` such units of the largest; what is not a number must be so in both.
+    `ulps` units in the last place off, and `scale` such units of the largest, or of `LEAST`; what is not a number must be so in both.
     """
     found, wanted = np.asarray(found), np.asarray(wanted)
     assert (found.dtype, found.shape) == (wanted.dtype, wanted.shape), (
@@ -50,7 +54,9 @@ def _near(found: np.ndarray, wanted: np.ndarray, ulps: float, scale: float, size
     info = np.finfo(found.dtype)
     finite = np.where(np.isfinite(wanted), np.abs(wanted), 0)
     with np.errstate(all="ignore"):
-        most = ulps * info.eps * np.where(np.isfinite(size), size, finite) + scale * info.eps * finite.max(initial=0)
+        most = ulps * info.eps * np.where(np.isfinite(size), size, finite) + scale * info.eps * finite.max(
+            initial=LEAST
+        )
         near = np.isfinite(found) & np.isfinite(wanted) & (np.abs(found - wanted) <= most)
         # Rounded to infinity in one of them.
         near |= (ulps > 0) & (np.abs(found) >= info.max) & (np.abs(wanted) >= info.max) & (found * wanted > 0)
