@@ -19,6 +19,9 @@ class Thresholds:
     - `thread_bytes`: bytes of a buffer that a thread on a GPU has of its own, since the device keeps as much for each that may run;
       larger ones are in a buffer of XLA's that all threads share, number beside number.
     - `fused_depth`: operations in one loop; more would nest our own calls too deep.
+    - `vectorised`: turns from which on LLVM may make a loop over an array one of vectors. Of 11 it gains nothing by that, and takes a
+      third more time: the pendulum by dummy derivatives and Radau is ready in 7.1 s in place of 8.4; the double pendulum by Radau,
+      whose loops have 14 and more, takes 8.2 ms so and 10.7 without.
     - `long_loop`: turns from which on loops use the machine's longest vectors: a chain of 64 pendulums gains 15 %, arrays of ten
       lose 25 %.
 
@@ -57,6 +60,7 @@ class Thresholds:
     heap_bytes: int = 2**30
     thread_bytes: int = 2**12
     fused_depth: int = 40
+    vectorised: int = 12
     long_loop: int = 256
     written_out: int = 200
     turns_written_out: int = 8000

@@ -23,9 +23,10 @@ TUNING = {"loop_vectorization": True, "slp_vectorization": False, "loop_unrollin
 HEAVY = 45_000
 # And modules that compute so many addresses, unless one of `PER_LOOP` is in a loop of `LONG` turns or more. What LLVM's passes take
 # grows with the memory that is written to, what they gain comes from long loops: the double pendulum by dummy derivatives (6,000
-# addresses, 46 long loops) is ready in 4.6 s without them and in 8.1 with, and takes 3.6 and 2.9 ms; Andrews' mechanism by Radau
-# (7,000 and 340) in 6 and 12 s, and takes 49 and 22 ms.
-ADDRESSES, PER_LOOP, LONG = 5_000, 50, 25
+# addresses, 46 long loops) is ready in 4.6 s without them and in 8.1 with, and takes 3.6 and 2.9 ms, and after its kernel has become
+# shorter (4,500) in 6.3 and 8.5 s, and takes 26 and 20 ms; Andrews' mechanism by Radau (7,000 and 340) in 6 and 12 s, and takes 49 and
+# 22 ms.
+ADDRESSES, PER_LOOP, LONG = 4_000, 50, 25
 # And modules of more loops, each of which takes the passes 10 ms, unless a half of them is `VERY_LONG`: one evaluation of a Stewart
 # platform (730) is ready in 7.7 s with them and in 1.5 without, and takes 45 and 63 µs; Andrews' mechanism by Radau (440) gains by them,
 # and so does a system of 3,000 unknowns by Radau (530, of which 460 are long), which takes 400 ms and 870 without.

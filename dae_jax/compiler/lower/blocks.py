@@ -27,7 +27,7 @@ def loop(code: Instructions, count: Index, phis: list[str] | None = None) -> Ite
     code.lines.append(f"%{following} = add i64 %{index}, 1")
     own = f"%{index} = phi i64 [ 0, %{before} ], [ %{following}, %{code.block} ]"
     code.lines[here:here] = [own, *(phis or [])]
-    code.jump(head)
+    code.jump(head, in_order=code.width > 1 or (isinstance(count, int) and count < THRESHOLDS.vectorised))
     code.label(after)
 
 

@@ -148,9 +148,11 @@ class Instructions:
         self.lines.append(f"{name}:")
         self.block = name
 
-    def jump(self, name: str) -> None:
-        """A block ends, and the one of this name comes next."""
-        self.lines.append(f"br label %{name}")
+    def jump(self, name: str, in_order: bool = False) -> None:
+        """A block ends, and the one of this name comes next; `in_order`: of a loop that LLVM shall not make one of vectors."""
+        if in_order:
+            self.declared["loops"] = '!0 = distinct !{!0, !1}\n!1 = !{!"llvm.loop.vectorize.enable", i1 false}'
+        self.lines.append(f"br label %{name}{', !llvm.loop !0' if in_order else ''}")
 
     def branch(self, condition: Value, yes: str, no: str) -> None:
         """A block ends, and one of two comes next."""
