@@ -265,7 +265,8 @@ class TestSingularConfiguration:
     @pytest.mark.parametrize("solver", [dae_jax.TangentSpace(diffrax.Dopri8()), dae_jax.RadauIIA5()], ids=str)
     def test_a_slider_crank_of_equal_lengths_passes_its_dead_centre(self, solver):
         system, y0 = crank_of_equal_lengths()
-        with pytest.warns(dae_jax.AccuracyWarning, match="dead centre"):
+        # Rounding decides whether a step ends where there is no way on.
+        with dae_jax.configure(optimise=True), pytest.warns(dae_jax.AccuracyWarning, match="dead centre"):
             sol = solve(system, solver, y0, t1=3.0, saveat=diffrax.SaveAt(t0=True, t1=True))
         energy = dae_jax.energy(system, sol)
         assert abs(energy[1] - energy[0]) < 1e-5

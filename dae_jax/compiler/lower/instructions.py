@@ -149,9 +149,7 @@ class Instructions:
         self.block = name
 
     def jump(self, name: str, in_order: bool = False) -> None:
-        """A block ends, and the one of this name comes next; `in_order`: of a loop that LLVM shall not make one of vectors."""
-        if in_order:
-            self.declared["loops"] = '!0 = distinct !{!0, !1}\n!1 = !{!"llvm.loop.vectorize.enable", i1 false}'
+        """A block ends, and the one of this name comes next; `in_order`: of a loop that LLVM makes none of vectors."""
         self.lines.append(f"br label %{name}{', !llvm.loop !0' if in_order else ''}")
 
     def branch(self, condition: Value, yes: str, no: str) -> None:
@@ -288,8 +286,8 @@ class Instructions:
 
     def cast(self, code: str, x: Value, kind: str, joined: bool = False) -> Value:
         """A number as one of another type; `joined`: the bits of all lanes as one number."""
-        lanes = x.lanes and not joined
-        return self.pure(f"{code} {self.type(x.kind, x.lanes)} {x.name} to {self.type(kind, lanes)}", kind, lanes)
+        to = self.type(kind, x.lanes and not joined)
+        return self.pure(f"{code} {self.type(x.kind, x.lanes)} {x.name} to {to}", kind, x.lanes and not joined)
 
 
 def parts(x: Number) -> tuple[Any, Any]:

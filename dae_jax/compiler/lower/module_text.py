@@ -21,6 +21,10 @@ from .lane_queue import LaneQueue, NotQueued, main_loop
 from .lowering import Lowering, TooLarge
 
 
+# Of the loops that LLVM shall not make ones of vectors.
+IN_ORDER = '!0 = distinct !{!0, !1}\n!1 = !{!"llvm.loop.vectorize.enable", i1 false}'
+
+
 def module_text(annotated: Annotated, always_copies: bool = False, limit: float = np.inf) -> str:
     """The module whose function `{name}.kernel` computes the outputs from the inputs.
 
@@ -71,7 +75,7 @@ class _Module:
             functions = in_threads([*found, *body], self._find_batch(), code.width)
         else:
             functions = alone([*found, *body], code.longest >= THRESHOLDS.long_loop)
-        return "\n".join([*constants, *code.declared.values(), *self.lowering.procedures.lines, *functions])
+        return "\n".join([*constants, *code.declared.values(), *self.lowering.procedures.lines, *functions, IN_ORDER])
 
     def _find_batch(self) -> list[str]:
         """The instructions that find the size of the batch."""
