@@ -9,8 +9,8 @@ from pathlib import Path
 
 
 os.environ.setdefault("MPLBACKEND", "Agg")
-# A third of the time of all tests would be LLVM's, for programs that run a few times. Those of the compiler and of each method, the
-# notebooks and the command line run what users run.
+# A third of the time of all tests would be LLVM's, for programs that run a few times. Those of the compiler and the notebooks run what
+# users run.
 os.environ.setdefault("DAE_JAX_OPTIMISE", "0")
 
 import jax
