@@ -69,3 +69,9 @@ def _forget_what_was_compiled():
     """A module's programs are of no use to the next, and take gigabytes."""
     yield
     jax.clear_caches()
+
+
+@pytest.fixture
+def nothing_forgotten(monkeypatch):
+    """For tests that count what is traced: the limit of what is kept counts all tests' problems, and may be reached within one."""
+    monkeypatch.setattr("dae_jax.driver.program.KEPT", float("inf"))

@@ -225,8 +225,7 @@ def test_work_precision_is_drawn_where_there_is_a_reference():
     assert not dict(figures.figures(scene, [], [], {}, 1e-8, paper=False))
 
 
-def test_other_tolerances_compile_nothing(monkeypatch):
-    monkeypatch.setattr(program, "KEPT", np.inf)  # nothing is forgotten between the solves
+def test_other_tolerances_compile_nothing(nothing_forgotten):
     scene = SCENES["pendulum"]()
     times = scene.times(0.1, 5)
     for name in ("projection-tsit5", "rattle"):

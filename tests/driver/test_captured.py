@@ -212,8 +212,7 @@ def end(system, **options):
     return dae_jax.daesolve(system, SOLVER, 0.0, 1.0, None, START, **options).ys[0][-1]
 
 
-def test_in_a_solve(case, monkeypatch):
-    monkeypatch.setattr(program, "KEPT", np.inf)  # nothing is forgotten between the solves
+def test_in_a_solve(case, nothing_forgotten):
     system = ConstrainedSystem(case.force, circle)
     before, count = end(system), program._jitted._cache_size()
     assert np.array_equal(end(system), before)
@@ -418,8 +417,7 @@ def made(k, xp=jnp, doubled=False):
     return lambda t, q, v, args: xp.asarray(inner(scale)) + 0 * q
 
 
-def test_a_function_that_is_made_anew_is_the_same_one(monkeypatch):
-    monkeypatch.setattr(program, "KEPT", np.inf)
+def test_a_function_that_is_made_anew_is_the_same_one(nothing_forgotten):
     assert current(made(1.0)) == current(made(1.0))
     assert current(lambda t: t) != current(lambda t: t + 1)
     assert current(lambda t: 1) != current(lambda t: 1.0)
@@ -460,10 +458,8 @@ def test_what_is_made_anew_is_not_taken_for_one_that_has_changed_since():
     assert (of_first.deeper["k"], of_second.deeper["k"]) == (1.0, 9.0)
 
 
-def test_a_mechanism_that_is_made_anew_is_compiled_once(monkeypatch):
+def test_a_mechanism_that_is_made_anew_is_compiled_once(nothing_forgotten):
     from dae_jax import mechanisms as m
-
-    monkeypatch.setattr(program, "KEPT", np.inf)
 
     def angle(length, strength):
         bar = m.Body("bar", 1.0, 0.1, at=(length, 0.0))
@@ -528,7 +524,7 @@ class Held:
 
 
 @pytest.mark.parametrize("deep", [False, True])
-def test_an_object_in_the_arguments(deep):
+def test_an_object_in_the_arguments(deep, nothing_forgotten):
     """It may change between two calls, which is seen everywhere; a solution keeps the one that it was computed with."""
     held = Held(9.81)
     system = ConstrainedSystem(

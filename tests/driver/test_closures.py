@@ -74,7 +74,7 @@ def test_however_a_function_has_captured_a_number(way):
     np.testing.assert_allclose(jax.jit(CAPTURED[way])(1.1), by_args(1.1), rtol=1e-14)
 
 
-def test_a_function_that_is_made_anew_for_each_number_is_compiled_once():
+def test_a_function_that_is_made_anew_for_each_number_is_compiled_once(nothing_forgotten):
     fn = jax.value_and_grad(CAPTURED["closure"])
     fn(1.1)
     before = len(program._traced)
