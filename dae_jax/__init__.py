@@ -33,6 +33,7 @@ from .formulations import (
     Residual as Residual,
     StateSpace as StateSpace,
 )
+from .linalg.iterative import GMRES as GMRES
 from .solution import (
     RESULTS as RESULTS,
     VIEWS as _VIEWS,

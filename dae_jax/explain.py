@@ -221,6 +221,7 @@ def explain(
     method = f"{(formulation or solve.formulation).name}, {_name(solver)}"
     if takes_residuals(solve.solver):
         y, linearised = solve.formulation.encode(system, t0, y0, args)
+        linearised = linearised.solved_by(solve.solver.linear_solver)
         return _of_residual(linearised, t0, y, method, precision, compiled)
     if solve.formulation.selects_states or not is_mechanism(system):
         ode = StructuralODE.of(ResidualForm.of(system, t0, y0, args), jnp.result_type(t0))

@@ -89,7 +89,8 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
     singular_iteration_matrix = (
         "The iteration matrix ∂F/∂y + c ∂F/∂ẏ is singular, however small the step: the equations do not determine all "
-        "unknowns here. `dae_jax.analyse` shows the index and which variable each equation determines."
+        "unknowns here. `dae_jax.analyse` shows the index and which variable each equation determines. (With "
+        "`linear_solver=GMRES(...)`, where that does not converge too: a better preconditioner, more products, `most`.)"
     )
     undetermined = (
         "On its way the solution has passed states at which the equations do not determine all unknowns: the matrix of their highest "

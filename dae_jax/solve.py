@@ -157,7 +157,8 @@ def prepared(
                 "OrthogonalProjection(DOP853())."
             )
     if formulation.selects_states and takes_residuals(solver):
-        formulation, solver = ReducedResidual(), SelectedResiduals(solver.rtol, solver.atol, solver=solver)
+        inner, given = solver, {name: getattr(solver, name) for name in ("rtol", "atol", "linear_solver")}
+        formulation, solver = ReducedResidual(), SelectedResiduals(**given, solver=inner)
     elif formulation.selects_states:
         solver = SelectedStates(solver)
     dtype = jnp.result_type(*jax.tree.leaves(y0))

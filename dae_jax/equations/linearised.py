@@ -13,6 +13,7 @@ from scipy.sparse import csr_array
 
 from ..linalg import fixed_point, relative_change
 from ..linalg.dense import LOOPED
+from ..linalg.iterative import GMRES, Iterative
 from ..linalg.sparse import Sparse
 from ..linalg.storage import Banded, Dense
 from ..structure import (
@@ -32,7 +33,7 @@ from .probe import Probe
 from .residual_form import LARGE, ResidualForm
 
 
-Storage: TypeAlias = Dense | Banded | Sparse
+Storage: TypeAlias = Dense | Banded | Sparse | Iterative
 
 GAUSS_NEWTON = 5
 # Where each takes a factorisation, no more than are needed, and at most:
@@ -40,6 +41,8 @@ DEAR_CORRECTIONS = 20
 # What a multiplication by a band, and one of sparse factors, costs, in parts of one of a dense matrix: 150 unknowns with 14,000 entries in
 # the factors take 12.7 ms and 19.2 dense, 80 with 5,500 take 10.5 and 5.7. Where pivots are chosen by numbers, SuperLU takes most of it.
 BAND_COST, SPARSE_COST, PIVOTED_COST = 4, 2, 16
+# Of more unknowns no dense matrix is factorised, however full the sparse factors are: that takes seconds.
+NEVER_DENSE = 4000
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -148,8 +151,9 @@ class LinearisedResidual(eqx.Module):
         return _combined(self.structure.combination.of_sizes, terms, jnp.abs(c)) * jnp.finfo(size.dtype).eps
 
     def column_scale(self, h: Time) -> Float[Array, " n"]:
-        """h^dⱼ."""
-        return powers(jnp.minimum(jnp.abs(h), 1), self.structure.offsets)
+        """h^dⱼ, or 1 where the storage takes the unknowns as they are."""
+        offsets = self.structure.offsets
+        return powers(jnp.minimum(jnp.abs(h), 1), offsets if self.storage.graded else (0,) * len(offsets))
 
     def solve(self, factors: PyTree, b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
         """x with (J + c M) x = b."""
@@ -179,6 +183,10 @@ class LinearisedResidual(eqx.Module):
         if self.storage.dear:
             return fixed_point(correct, start, max_steps=DEAR_CORRECTIONS)[0]
         return jax.lax.fori_loop(0, GAUSS_NEWTON, lambda _, yd: improved(yd), start)
+
+    def solved_by(self, method: GMRES | None) -> "LinearisedResidual":
+        """With another method for its linear equations, where one is given."""
+        return self if method is None else dataclasses.replace(self, structure=_iterative(self.structure, method))
 
     def starting(self, t: Time, y: Float[Array, " n"]) -> "LinearisedResidual":
         """For a solve from (t, y)."""
@@ -272,6 +280,11 @@ def _outline(
     )
 
 
+@functools.lru_cache(maxsize=64)
+def _iterative(structure: JacobianStructure, method: GMRES) -> JacobianStructure:
+    return dataclasses.replace(structure, storage=Iterative(structure.storage, method))
+
+
 def _storage(pattern: csr_array, by_rate: csr_array, transversal: list[int], pivots: bool) -> Storage:
     """Sparse factors or, where `pivots` are to be chosen within the kernel, a band with each equation in the place of its variable."""
     n = len(transversal)
@@ -291,6 +304,8 @@ def _storage(pattern: csr_array, by_rate: csr_array, transversal: list[int], piv
     rows, columns = pattern.nonzero()
     sparse = Sparse(rows, columns, pairing, _is_in(by_rate, rows, columns))
     cost = PIVOTED_COST if pivots else SPARSE_COST
+    if n > NEVER_DENSE:
+        return sparse
     return sparse if cost * sparse.symbolic.cost <= n**3 / 3 else Dense(n)
 
 

@@ -1,4 +1,4 @@
-"""LU of a sparse matrix with partial pivoting, by SuperLU on the host.
+"""LU of a sparse matrix with partial pivoting, whole or incomplete, by SuperLU on the host.
 
 Each call is a function of numbers alone; that the same matrix has been factorised before is remembered beside it.
 """
@@ -19,11 +19,16 @@ KEPT = 8
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PivotedLU:
-    """For matrices with entries at (`rows`, `columns`). Compared by identity."""
+    """For matrices with entries at (`rows`, `columns`). Compared by identity.
+
+    `drop`: entries of the factors that are less than this part of their column are left out; then what is called an inverse is
+    about one.
+    """
 
     rows: Int[np.ndarray, " entries"]
     columns: Int[np.ndarray, " entries"]
     size: int
+    drop: float | None = None
 
     def solve(self, a: Inexact[Array, " entries"], b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
         """x with A x = b, and its derivative; NaN where A is singular or not finite."""
@@ -87,7 +92,7 @@ def _key(a: Any) -> tuple[bytes, str]:
 
 @functools.lru_cache(maxsize=KEPT)
 def _remembered(pattern: PivotedLU, entries: bytes, dtype: str) -> HostFactors:
-    return factorised(pattern.rows, pattern.columns, np.frombuffer(entries, dtype), pattern.size)
+    return factorised(pattern.rows, pattern.columns, np.frombuffer(entries, dtype), pattern.size, pattern.drop)
 
 
 def factorised(
@@ -95,10 +100,11 @@ def factorised(
     columns: Int[np.ndarray, " entries"],
     a: Inexact[np.ndarray, " entries"],
     n: int,
+    drop: float | None = None,
 ) -> HostFactors:
-    """The factors of the n × n matrix with entries `a`."""
+    """The factors of the n × n matrix with entries `a`; `drop` as for `PivotedLU`."""
     from scipy.sparse import csc_array
-    from scipy.sparse.linalg import splu
+    from scipy.sparse.linalg import spilu, splu
 
     largest = np.zeros(n, np.finfo(a.dtype).dtype)
     if not np.isfinite(a).all():
@@ -107,8 +113,10 @@ def factorised(
     if not largest.all():
         return HostFactors(None, largest)
     scale = 1 / largest
+    matrix = csc_array((a * scale[rows], (rows, columns)), shape=(n, n))
+    matrix.eliminate_zeros()
     try:
-        lu = splu(csc_array((a * scale[rows], (rows, columns)), shape=(n, n)))
+        lu = splu(matrix) if drop is None else spilu(matrix, drop, permc_spec="MMD_AT_PLUS_A", drop_rule="basic")
     except RuntimeError:
         # Exactly singular.
         lu = None

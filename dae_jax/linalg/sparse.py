@@ -41,6 +41,7 @@ class Sparse:
 
     # To factorise takes as long as many solutions do.
     dear: ClassVar[bool] = True
+    graded: ClassVar[bool] = True
 
     @property
     def size(self) -> int:

@@ -26,8 +26,9 @@ class Dense:
 
     size: int
 
-    # Whether to factorise takes as long as many solutions do.
+    # Whether to factorise takes as long as many solutions do; whether it needs columns that are graded by powers of the step size.
     dear: ClassVar[bool] = False
+    graded: ClassVar[bool] = True
 
     def describe(self) -> str:
         """In words."""
@@ -99,6 +100,7 @@ class Banded:
     upper: int
 
     dear: ClassVar[bool] = False
+    graded: ClassVar[bool] = True
 
     @property
     def size(self) -> int:

@@ -152,6 +152,7 @@ class BDF(Replayable, AbstractResidualSolver):
     - `dense`: whether values between steps are wanted (`daesolve` sets it as `saveat` and `event` need it): then the user's
       variables of index 2 and higher are in the error test too.
     - `rtol`, `atol`: by default those of the step-size controller, which must not differ.
+    - `linear_solver`: a `GMRES(...)` for systems that are too large for factors.
 
     The step size follows from the order, so it is the solver that finds it, and the error it returns is the one from
     which a `diffrax.PIDController` with its default coefficients finds the same.
@@ -179,7 +180,7 @@ class BDF(Replayable, AbstractResidualSolver):
 
     def init(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any) -> _State:
         sign = time_sign(terms, t0, t1)
-        like = _Step(args, sign, t1, t1 - t0, 1 / (t1 - t0), y0, y0)
+        like = _Step(args.solved_by(self.linear_solver), sign, t1, t1 - t0, 1 / (t1 - t0), y0, y0)
         tol = tolerances(self.rtol, self.atol, y0.dtype)
         factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda: like.factor(y0, tol)))
         return _start(sign * args.start, factors, Work.none())
@@ -208,7 +209,8 @@ class BDF(Replayable, AbstractResidualSolver):
             )
         tol = tolerances(self.rtol, self.atol, y0.dtype)
         k, method = state.order, _formula(state.order, state.steps == 0, state.psi, h)
-        step, star = _predicted(method, k, state.phi, args, sign, t1, h, y0)
+        linearised = args.solved_by(self.linear_solver)
+        step, star = _predicted(method, k, state.phi, linearised, sign, t1, h, y0)
         y1, (newton, passes, factors, work) = _point(
             lambda params: _solve(*params), (step, *constant((y0, state, is_smallest(t0, t1))), tol)
         )
@@ -253,7 +255,7 @@ class BDF(Replayable, AbstractResidualSolver):
         h, sign, k = jnp.where(t1 == t0, 1, t1 - t0), time_sign(terms, t0, t1), dense["order"].astype(int)
         phi, psi = history
         method = _formula(k, dense["first"] > 0, psi, h)
-        step, star = _predicted(method, k, phi, args, sign, t1, h, y0)
+        step, star = _predicted(method, k, phi, args.solved_by(self.linear_solver), sign, t1, h, y0)
         found = constant(dense["phi"][0]), tolerances(self.rtol, self.atol, y0.dtype)
         y1, _ = _point(lambda params: (params[1], ()), (step, *found))
         dense = {**dense, "phi": jnp.stack(_differences(y1 - step.y, star, k)[1]), "psi": method.psi}

@@ -107,7 +107,7 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
     def init(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any) -> RadauState:
         sign = time_sign(terms, t0, t1)
         zero = jnp.zeros((), y0.dtype)
-        step = Step(coefficients(self.stages), args, sign, t0, t1, y0)
+        step = Step(coefficients(self.stages), args.solved_by(self.linear_solver), sign, t0, t1, y0)
         tol = self.fitted_tolerances(y0.dtype)
         unused = jax.eval_shape(lambda: (j := step.jacobians(t0, y0, y0), step.factor(j, tol)))
         jacobians, factors = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), unused)
@@ -139,7 +139,8 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
         state = solver_state._replace(
             refresh=solver_state.refresh | made_jump, h=jnp.where(made_jump, 0, solver_state.h)
         )
-        step = Step(coefficients(self.stages), args, time_sign(terms, t0, t1), t0, t1, y0)
+        linearised = args.solved_by(self.linear_solver)
+        step = Step(coefficients(self.stages), linearised, time_sign(terms, t0, t1), t0, t1, y0)
         tol = self.fitted_tolerances(y0.dtype)
         z, (newton, jacobians, factors, work) = _stages(lambda params: _solve(*params), (step, constant(state), tol))
         y1 = y0 + z[-1]
@@ -150,7 +151,7 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
         scaled = jnp.where(smallest, bend, counted)
         error = constant(tol.norm(scaled, y0, y1))
         failure = of_step(newton.converged, factors.probe.determined, error)
-        scaled = scaled * self._held(args, error, newton)
+        scaled = scaled * self._held(linearised, error, newton)
         y1, scaled, result = at_min_step(failure, t0, t1, y0, y1, scaled)
         slow = (newton.theta > FAST) & (newton.count > 1)
         # What jumped says nothing of the next step.
@@ -175,7 +176,8 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
     def replay(
         self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any, history: Any, dense: Any
     ) -> Any:
-        step = Step(coefficients(self.stages), args, time_sign(terms, t0, t1), t0, t1, y0)
+        linearised = args.solved_by(self.linear_solver)
+        step = Step(coefficients(self.stages), linearised, time_sign(terms, t0, t1), t0, t1, y0)
         z, _ = _stages(lambda params: (params[1], ()), (step, constant(dense["z"])))
         return y0 + z[-1], history, {"y0": y0, "z": z}
 
@@ -228,6 +230,7 @@ class RadauIIA5(AbstractRadauIIA):
 
     - `rtol`, `atol`: the tolerances that Newton's method is fitted to; by default those of the step-size controller, and
       round-off for fixed steps.
+    - `linear_solver`: a `GMRES(...)` for systems that are too large for factors.
 
     Source: E. Hairer, G. Wanner, *Solving Ordinary Differential Equations II*, sections IV.8 and VII.4 and the program
     RADAU5; E. Hairer, C. Lubich, M. Roche, *The Numerical Solution of Differential-Algebraic Systems by Runge–Kutta
@@ -246,7 +249,7 @@ class RadauIIA9(AbstractRadauIIA):
 
     **Arguments**
 
-    - `dense`, `rtol`, `atol`: as for `RadauIIA5`.
+    - `dense`, `rtol`, `atol`, `linear_solver`: as for `RadauIIA5`.
 
     Source: E. Hairer, G. Wanner, *Stiff differential equations solved by Radau methods*, J. Comput. Appl. Math. 111 (1999), and
     the program RADAU.
@@ -264,7 +267,7 @@ class RadauIIA13(AbstractRadauIIA):
 
     **Arguments**
 
-    - `dense`, `rtol`, `atol`: as for `RadauIIA5`.
+    - `dense`, `rtol`, `atol`, `linear_solver`: as for `RadauIIA5`.
 
     Source: as for `RadauIIA9`.
     """

@@ -62,9 +62,9 @@ class Radau(Replayable, AbstractResidualSolver):
 
     **Arguments**
 
-    - `dense`, `rtol`, `atol`: as for `RadauIIA5`. The error that a step-size controller is given is one from which it finds the
-      size for the order of the step, where its coefficients are the default ones; with others steps are of other sizes, and as
-      accurate.
+    - `dense`, `rtol`, `atol`, `linear_solver`: as for `RadauIIA5`. The error that a step-size controller is given is one from which
+      it finds the size for the order of the step, where its coefficients are the default ones; with others steps are of other
+      sizes, and as accurate.
 
     Source: E. Hairer, G. Wanner, *Stiff differential equations solved by Radau methods*, J. Comput. Appl. Math. 111 (1999),
     section 3, and the program RADAU.
@@ -84,7 +84,7 @@ class Radau(Replayable, AbstractResidualSolver):
     @property
     def methods(self) -> list[AbstractRadauIIA]:
         """Those to choose from, by the number of their stages."""
-        return [method(self.rtol, self.atol, self.dense) for method in METHODS]
+        return [method(self.rtol, self.atol, self.dense, linear_solver=self.linear_solver) for method in METHODS]
 
     def order(self, terms: diffrax.AbstractTerm) -> int:
         return self.methods[-1].order(terms)

@@ -12,6 +12,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ..linalg import rms_norm
+from ..linalg.iterative import GMRES
 
 
 # As equinox has it.
@@ -62,7 +63,7 @@ class AbstractResidualSolver(diffrax.AbstractAdaptiveSolver):
     """A solver of 0 = F(t, y, ẏ); needs a `LinearisedResidual` as `args`, one that is `starting`.
 
     `rtol`, `atol`: the tolerances that Newton's method is fitted to; by default those of the step-size controller, and
-    round-off for fixed steps.
+    round-off for fixed steps. `linear_solver`: by which linear equations are solved, if not by factors.
     """
 
     # Up to which index the method converges, and takes the equations as they are written where nothing else is asked for.
@@ -73,6 +74,7 @@ class AbstractResidualSolver(diffrax.AbstractAdaptiveSolver):
 
     rtol: Any = None
     atol: Any = None
+    linear_solver: GMRES | None = eqx.field(default=None, kw_only=True, static=True)
 
     term_structure = diffrax.AbstractTerm
 

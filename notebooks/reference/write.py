@@ -36,7 +36,7 @@ PAGES = {
         "Solvers",
         "How a step is taken; beside these, any solver of diffrax. [Which method when](../which_method.md).",
         "OrthogonalProjection TangentSpace SymmetricProjection Trapezoid Midpoint Gauss4 RATTLE DOP853 RadauIIA5 "
-        "RadauIIA9 RadauIIA13 Radau BDF AbstractManifoldSolver AbstractResidualSolver",
+        "RadauIIA9 RadauIIA13 Radau BDF GMRES AbstractManifoldSolver AbstractResidualSolver",
     ),
     "starts_and_events": (
         "Starts and events",
