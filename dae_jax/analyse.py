@@ -165,7 +165,7 @@ class Structure:
             many = ("degree of freedom of the mechanism", "degrees of freedom of the mechanism")
             freedom = f"{counted(self.mechanical_degrees_of_freedom, *many)} ({freedom})"
         if not self.regular:
-            freedom = f"at most {freedom}"
+            freedom = f"{freedom} by the count of equations"
         lines = [
             f"{counted(len(self.equations), 'equation')}, index {self.index}{'' if self.regular else ' or higher'}, {freedom}, "
             f"{self._blocks_in_words}, {counted(self.nonzeros, 'nonzero')}, bandwidth {self.bandwidth}",
@@ -176,6 +176,11 @@ class Structure:
                 "higher. Replace an equation by a combination of equations in which the cancelling terms are gone, or "
                 "introduce the cancelling expression as a variable."
             )
+            if self.mechanical_degrees_of_freedom is not None:
+                lines.append(
+                    "Constraints that say nothing new leave more degrees of freedom than the count says: `explain` says how many "
+                    "are independent, and `daesolve` takes so many."
+                )
         if len(self.equations) > DRAWN:
             return "\n".join(lines)
         width = max(map(len, self.equations))
@@ -194,11 +199,12 @@ class Structure:
     def _repr_html_(self) -> str:
         """A table for a notebook, and the whole page folded."""
         freedom = self.mechanical_degrees_of_freedom
+        higher, by_count = ("", "") if self.regular else (" or higher", ", by the count of equations")
         rows = {
             "equations": str(len(self.equations)),
-            "index": str(self.index),
-            "degrees of freedom": "" if freedom is None else f"{freedom}, of the mechanism",
-            "initial values to choose": str(self.degrees_of_freedom),
+            "index": f"{self.index}{higher}",
+            "degrees of freedom": "" if freedom is None else f"{freedom}, of the mechanism{by_count}",
+            "initial values to choose": f"{self.degrees_of_freedom}{by_count}",
             "hidden constraints": _named(self.hidden_constraints()),
             "blocks": self._blocks_in_words,
             "nonzeros, bandwidth": f"{self.nonzeros}, {self.bandwidth}",

@@ -91,8 +91,10 @@ def daesolve(
       after it. Derivatives are those of the numerical solution: where steps leap over a kink of a function (`abs`, `where`, `sort`)
       they are right to about the square root of the tolerance; make its time known (`jump_ts`), or a `Reset` of it. Where it jumps
       at a time that depends on what is differentiated, they lack that dependence, as the derivative of `where` does: a `Reset` has
-      it. Second derivatives are there in any order of modes, third ones with `jax.jacfwd` outside; with a progress meter or without
-      one kernel forward-mode derivatives need `adjoint=diffrax.ForwardMode()`.
+      it. Steps are chosen for the solution, not for its derivatives: where that rests, in an equilibrium, or moves steadily, they grow
+      beyond what the derivatives need, and a linearisation about such a motion wants steps of a part of its time scale (`dtmax` of
+      the controller, or `dt0`). Second derivatives are there in any order of modes, third ones with `jax.jacfwd` outside; with a
+      progress meter or without one kernel forward-mode derivatives need `adjoint=diffrax.ForwardMode()`.
 
     **Returns** a `DAESolution`.
 

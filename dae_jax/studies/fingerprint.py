@@ -17,6 +17,8 @@ from ..compiler.jaxprs.walk import equations, held_by
 
 
 ADDRESS = re.compile(r"0x[0-9a-f]+")
+# What a global may be that a function reads.
+NUMBERS = (bool, int, float, complex, str, bytes, list, tuple, dict, np.ndarray, np.generic, jax.Array)
 
 
 def fingerprint(fn: Callable[..., PyTree], one: PyTree, elements: PyTree, chunk: int) -> str:
@@ -35,8 +37,8 @@ def fingerprint(fn: Callable[..., PyTree], one: PyTree, elements: PyTree, chunk:
 
 
 def _parts(x: Any, seen: dict[int, object]) -> Iterator[bytes]:
-    """The numbers of arrays, the code of functions and what they close over, the fields of objects, of other things what they
-    print. `seen` keeps what it names by its address: another thing could have it later.
+    """The numbers of arrays, the code of functions, what they close over and the globals that they read, the fields of objects, of
+    other things what they print. `seen` keeps what it names by its address: another thing could have it later.
     """
     if isinstance(x, np.ndarray | np.generic | jax.Array):
         if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
@@ -61,16 +63,32 @@ def _parts(x: Any, seen: dict[int, object]) -> Iterator[bytes]:
     elif isinstance(x, types.FunctionType):
         seen[id(x)] = x
         cells = [cell.cell_contents for cell in x.__closure__ or ()]
-        yield from _parts((x.__code__, x.__defaults__ or (), x.__kwdefaults__ or {}, cells), seen)
+        named = [x.__globals__.get(name) for name in x.__code__.co_names]
+        # Of functions those of the same module: a library's have caches.
+        named = [
+            value
+            for value in named
+            if isinstance(value, NUMBERS) or getattr(value, "__globals__", None) is x.__globals__
+        ]
+        yield from _parts((x.__code__, x.__defaults__ or (), x.__kwdefaults__ or {}, cells, named), seen)
     elif isinstance(x, functools.partial):
         yield from _parts((x.func, x.args, x.keywords), seen)
     elif callable(getattr(x, "callback_func", None)):
         yield from _parts(x.callback_func, seen)
     elif isinstance(getattr(x, "__wrapped__", None), types.FunctionType):
         yield from _parts(x.__wrapped__, seen)
-    elif hasattr(x, "__dict__") and not isinstance(x, type | types.ModuleType):
+    elif (fields := _fields(x)) is not None:
         seen[id(x)] = x
         yield repr(type(x)).encode()
-        yield from _parts((vars(type(x)).get("__call__"), vars(x)), seen)
+        yield from _parts((vars(type(x)).get("__call__"), fields), seen)
     else:
         yield ADDRESS.sub("", repr(x)).encode()
+
+
+def _fields(x: Any) -> dict[str, Any] | None:
+    """What an object holds by names, in a dictionary of its own or in slots; `None` of what has neither."""
+    slots = [name for of in type(x).__mro__ for name in vars(of).get("__slots__", ())]
+    if isinstance(x, type | types.ModuleType) or not (slots or hasattr(x, "__dict__")):
+        return None
+    held = {name: getattr(x, name) for name in slots if name != "__dict__" and hasattr(x, name)}
+    return held | getattr(x, "__dict__", {})

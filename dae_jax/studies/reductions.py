@@ -74,7 +74,8 @@ def lyapunov(
 
     δy is the derivative of the solution (tangent dynamics, by `jax.jvp`) in one direction, which is made consistent with
     the constraints and the hidden ones: `direction`, with the structure of `y0`, by default 1 everywhere. `options` are
-    those of `daesolve`, but for `event`, `saveat` and `adjoint`. NaN where a solve with `throw=False` failed. Derivatives of the
+    those of `daesolve`, but for `event`, `saveat` and `adjoint`. About an equilibrium or a steady motion give steps of a part of the time
+    scale: they are chosen for the solution, which has none there. NaN where a solve with `throw=False` failed. Derivatives of the
     exponent are found in forward mode (`jax.jacfwd`).
 
     Errors: `TypeError` for one of these three.

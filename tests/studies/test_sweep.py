@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 import dae_jax
 from dae_jax import reductions
@@ -141,6 +142,33 @@ class Scaled:
         return np.asarray(x / len({"a", "b"}))
 
 
+class Slotted:
+    __slots__ = ("factor",)
+
+    def __init__(self, factor):
+        self.factor = factor
+
+    def by(self, x):
+        return np.asarray(x * self.factor)
+
+
+FACTOR = 1.0
+
+
+def by_a_global(x):
+    return np.asarray(FACTOR * x)
+
+
+def test_a_global_that_a_callback_reads_counts(monkeypatch, tmp_path):
+    call = lambda x: jax.pure_callback(by_a_global, jax.ShapeDtypeStruct((), float), x, vmap_method="sequential")
+    run = lambda: dae_jax.sweep(call, np.ones(3), store=tmp_path / "s", progress=False)
+    np.testing.assert_array_equal(run(), 1)
+    np.testing.assert_array_equal(run(), 1)
+    monkeypatch.setitem(globals(), "FACTOR", 2.0)
+    with pytest.raises(ValueError, match="holds another sweep"):
+        run()
+
+
 def test_what_helpers_and_methods_compute_counts():
     """However deep they are closed over; and always with the same fingerprint."""
 
@@ -158,7 +186,9 @@ def test_what_helpers_and_methods_compute_counts():
         return outer
 
     hosts = [through(lambda x, n=n: x + n) for n in (1, 2)] + [through(lambda x: x - 1)]
-    hosts += [Scaled(2).by, Scaled(3).by, Scaled(2).half]
+    hosts += [Scaled(2).by, Scaled(3).by, Scaled(2).half, Slotted(2).by, Slotted(3).by]
+    x = np.linspace(0, 5, 9)
+    hosts += [CubicSpline(x, np.sin(x)).__call__, CubicSpline(x, np.cos(x)).__call__]
     found = [of(host) for host in hosts]
     assert len(set(found)) == len(hosts)
     assert [of(host) for host in hosts] == found
