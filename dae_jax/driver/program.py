@@ -239,7 +239,7 @@ class Solve:
         part = self.saveat.subs
         solver = economical(self.solver, self.between())
         view = View(part.fn, Decode(self.formulation, self.solver), problem.args)
-        return Taped(self.formulation, solver, part, problem.t0, problem.t1, y, ode, view)
+        return Taped(self.formulation, solver, part, problem.t0, problem.t1, problem.dt0, y, ode, view)
 
     def forwards(self) -> "Solve":
         """The same solve with forward derivatives."""

@@ -1,7 +1,7 @@
 """The reverse derivative of a solve from a tape of its accepted steps.
 
 The derivative is that of the discrete solution (discretise-then-optimise), as with `diffrax.RecursiveCheckpointAdjoint`;
-the sizes of the steps are constants, but for the last, which ends at t1. Forwards, the point of every accepted step is
+the sizes of the steps are constants, but for the last, which ends at t1, and for fixed ones. Forwards, the point of every accepted step is
 written down; backwards, each step is done once more together with its derivative. Both are loops of plain arithmetic,
 which compile to a kernel each; diffrax's checkpoints need library calls. It is used where the tape is small, and for
 solvers whose step is a function of its start, or that can `replay` it: of implicit ones the tape has the stages, and a step
@@ -69,6 +69,7 @@ class Taped(NamedTuple):
     part: Any
     t0: Any
     t1: Any
+    dt0: Any
     y: Any
     ode: Any
     view: Any
@@ -81,7 +82,8 @@ def cotangents(
 
     **Arguments**
 
-    - `fixed_steps`: whether the steps divide the interval evenly; otherwise all have sizes of their own but the last.
+    - `fixed_steps`: whether the first step is dt0 and the others end where they divide the interval evenly; otherwise all have
+      sizes of their own but the last.
     - `tape`: times and points of the accepted steps, the start first, and for a solver that replays them what is between;
       times that are not finite are padding.
     - `wanted`: the cotangents of the saved values, a leading axis of times.
@@ -128,6 +130,10 @@ def cotangents(
         evenly = jnp.where(k == 1, 0.0, (times[k] - taped.t0) / (taped.t1 - taped.t0)) if fixed_steps else 0.0
         fraction = jnp.where(times[k] == taped.t1, 1.0, evenly)
         return (1 - fraction) * cotangent, fraction * cotangent
+
+    def of_first(k: IntScalar, cotangent: Scalar) -> Scalar:
+        """The part of the cotangent of the k-th time that is dt0's, of fixed steps."""
+        return jnp.where((k == 1) & (times[k] != taped.t1), cotangent, 0.0)
 
     def saves_in_step(k: IntScalar, moving: PyTree, fixed: PyTree, carry: tuple[PyTree, ...]) -> Any:
         a, b = times[k], times[k + 1]
@@ -180,6 +186,9 @@ def cotangents(
         more_numbers, of_y, of_history, more_a, more_b = pull_back((of_y, of_history, of_dense))
         (a0, a1), (b0, b1) = shared(k, of_a + more_a), shared(k + 1, of_b + more_b)
         of_numbers = _sum(of_numbers, more_numbers)
+        if fixed_steps:
+            of_dt0 = of_first(k, of_a + more_a) + of_first(k + 1, of_b + more_b)
+            of_numbers = of_numbers._replace(dt0=of_numbers.dt0 + of_dt0)
         return k - 1, j, of_y, of_history, of_numbers, of_t0 + a0 + b0, of_t1 + a1 + b1, of_times
 
     of_y, of_numbers, zero = _zeros(_entry(points, 0)), _zeros(numbers), jnp.zeros_like(taped.t0)

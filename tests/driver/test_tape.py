@@ -20,8 +20,9 @@ SAVEATS = {
 
 
 def loss(x, saveat, solver, dt0, t0=0.1, t1=1.0, form=None, **options):
-    """Of the angle of the start, gravity, both times and a factor on the times saved at."""
-    angle, gravity, start, end, factor = x
+    """Of the angle of the start, gravity, both times, and factors on the times saved at and on the size of fixed steps."""
+    angle, gravity, start, end, factor, size = x
+    dt0 = None if dt0 is None else size * dt0
     system = dae_jax.ConstrainedSystem(lambda t, q, v, g: jnp.stack([0 * g, g]), SCENE.system.constraint)
     y0 = (jnp.stack([jnp.sin(angle), jnp.cos(angle)]), jnp.stack([jnp.cos(angle), -jnp.sin(angle)]))
     sol = dae_jax.daesolve(
@@ -54,7 +55,7 @@ BACKWARDS_BY_DIFFRAX = ("Tsit5", "radau")
 def test_equals_diffrax_with_respect_to_everything(name, saveat, steps):
     dt0 = STEPS[steps]
     times = (1.0, 0.1) if steps == "backwards" else (0.0, 1.0)
-    x = jnp.array([1.2, 9.81, 1.0, 1.0, 1.0])
+    x = jnp.array([1.2, 9.81, 1.0, 1.0, 1.0, 1.0])
     form = dae_jax.DummyDerivatives() if name == "selected states" else None
     solver = SOLVERS[name]
     of = lambda x, **options: loss(x, saveat, solver, dt0, *times, form, **options)
@@ -65,6 +66,7 @@ def test_equals_diffrax_with_respect_to_everything(name, saveat, steps):
     else:
         expected = jax.jacfwd(lambda x: of(x, adjoint=diffrax.ForwardMode()))(x)
     assert np.abs(expected).max() > 0.1
+    assert (expected[-1] != 0) == (dt0 is not None)
     # For steps of sizes of their own, diffrax lets the start of the interval move all of them; so does the tape.
     np.testing.assert_allclose(taped, expected, rtol=1e-8, atol=1e-9)
 
