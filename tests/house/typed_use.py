@@ -93,7 +93,7 @@ def methods() -> list[diffrax.AbstractSolver[Any]]:
         dae_jax.Radau(),
         dae_jax.RadauIIA9(),
         dae_jax.RadauIIA13(),
-        dae_jax.BDF(),
+        dae_jax.BDF(linear_solver=dae_jax.GMRES(restart=20)),
     ]
     return [*keeping, *of_residuals]
 
