@@ -152,6 +152,10 @@ class Structure:
         return tuple((names[i], k) for i, c in enumerate(self.equation_offsets) for k in range(c))
 
     @property
+    def _index_in_words(self) -> str:
+        return f"{self.index}{'' if self.regular else ' or higher'}"
+
+    @property
     def _blocks_in_words(self) -> str:
         """How many there are; of many, how many of each size, the largest first."""
         sizes = sorted(Counter(len(block.equations) for block in self.blocks).items(), reverse=True)
@@ -167,7 +171,7 @@ class Structure:
         if not self.regular:
             freedom = f"{freedom} by the count of equations"
         lines = [
-            f"{counted(len(self.equations), 'equation')}, index {self.index}{'' if self.regular else ' or higher'}, {freedom}, "
+            f"{counted(len(self.equations), 'equation')}, index {self._index_in_words}, {freedom}, "
             f"{self._blocks_in_words}, {counted(self.nonzeros, 'nonzero')}, bandwidth {self.bandwidth}",
         ]
         if not self.regular:
@@ -199,10 +203,10 @@ class Structure:
     def _repr_html_(self) -> str:
         """A table for a notebook, and the whole page folded."""
         freedom = self.mechanical_degrees_of_freedom
-        higher, by_count = ("", "") if self.regular else (" or higher", ", by the count of equations")
+        by_count = "" if self.regular else ", by the count of equations"
         rows = {
             "equations": str(len(self.equations)),
-            "index": f"{self.index}{higher}",
+            "index": self._index_in_words,
             "degrees of freedom": "" if freedom is None else f"{freedom}, of the mechanism{by_count}",
             "initial values to choose": f"{self.degrees_of_freedom}{by_count}",
             "hidden constraints": _named(self.hidden_constraints()),

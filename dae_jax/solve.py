@@ -159,8 +159,8 @@ def prepared(
                 "OrthogonalProjection(DOP853())."
             )
     if formulation.selects_states and takes_residuals(solver):
-        inner, given = solver, {name: getattr(solver, name) for name in ("rtol", "atol", "linear_solver")}
-        formulation, solver = ReducedResidual(), SelectedResiduals(**given, solver=inner)
+        formulation = ReducedResidual()
+        solver = SelectedResiduals(solver.rtol, solver.atol, linear_solver=solver.linear_solver, solver=solver)
     elif formulation.selects_states:
         solver = SelectedStates(solver)
     dtype = jnp.result_type(*jax.tree.leaves(y0))

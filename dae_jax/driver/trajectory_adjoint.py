@@ -1,11 +1,11 @@
 """The reverse derivative of a solve from a tape of its accepted steps.
 
 The derivative is that of the discrete solution (discretise-then-optimise), as with `diffrax.RecursiveCheckpointAdjoint`;
-the sizes of the steps are constants, but for the last, which ends at t1, and for fixed ones. Forwards, the point of every accepted step is
-written down; backwards, each step is done once more together with its derivative. Both are loops of plain arithmetic,
-which compile to a kernel each; diffrax's checkpoints need library calls. It is used where the tape is small, and for
-solvers whose step is a function of its start, or that can `replay` it: of implicit ones the tape has the stages, and a step
-costs its derivative alone.
+the sizes of the steps are constants, but for the last, which ends at t1, and for fixed ones. Forwards, the point of every
+accepted step is written down; backwards, each step is done once more together with its derivative. Both are loops of plain
+arithmetic, which compile to a kernel each; diffrax's checkpoints need library calls. It is used where the tape is small, and
+for solvers whose step is a function of its start, or that can `replay` it: of implicit ones the tape has the stages, and a
+step costs its derivative alone.
 """
 
 import dataclasses
@@ -125,15 +125,12 @@ def cotangents(
         path = solver.interpolation_cls(t0=direction * a, t1=direction * b, **eqx.combine(moving, fixed))
         return saved(numbers, t, path.evaluate(direction * t))
 
-    def shared(k: IntScalar, cotangent: Scalar) -> tuple[Any, Any]:
-        """The cotangent of the k-th time as those of t0 and t1: how diffrax's controllers make it from them."""
+    def shared(k: IntScalar, cotangent: Scalar) -> tuple[Any, Any, Any]:
+        """The cotangent of the k-th time as those of t0, t1 and dt0: how diffrax's controllers make it from them."""
         evenly = jnp.where(k == 1, 0.0, (times[k] - taped.t0) / (taped.t1 - taped.t0)) if fixed_steps else 0.0
         fraction = jnp.where(times[k] == taped.t1, 1.0, evenly)
-        return (1 - fraction) * cotangent, fraction * cotangent
-
-    def of_first(k: IntScalar, cotangent: Scalar) -> Scalar:
-        """The part of the cotangent of the k-th time that is dt0's, of fixed steps."""
-        return jnp.where((k == 1) & (times[k] != taped.t1), cotangent, 0.0)
+        first = jnp.where((k == 1) & (times[k] != taped.t1), 1.0, 0.0) if fixed_steps else 0.0
+        return (1 - fraction) * cotangent, fraction * cotangent, first * cotangent
 
     def saves_in_step(k: IntScalar, moving: PyTree, fixed: PyTree, carry: tuple[PyTree, ...]) -> Any:
         a, b = times[k], times[k + 1]
@@ -184,11 +181,10 @@ def cotangents(
                 k, moving, fixed, (j, of_numbers, of_dense, of_a, of_b, of_times)
             )
         more_numbers, of_y, of_history, more_a, more_b = pull_back((of_y, of_history, of_dense))
-        (a0, a1), (b0, b1) = shared(k, of_a + more_a), shared(k + 1, of_b + more_b)
+        (a0, a1, a2), (b0, b1, b2) = shared(k, of_a + more_a), shared(k + 1, of_b + more_b)
         of_numbers = _sum(of_numbers, more_numbers)
         if fixed_steps:
-            of_dt0 = of_first(k, of_a + more_a) + of_first(k + 1, of_b + more_b)
-            of_numbers = of_numbers._replace(dt0=of_numbers.dt0 + of_dt0)
+            of_numbers = of_numbers._replace(dt0=of_numbers.dt0 + a2 + b2)
         return k - 1, j, of_y, of_history, of_numbers, of_t0 + a0 + b0, of_t1 + a1 + b1, of_times
 
     of_y, of_numbers, zero = _zeros(_entry(points, 0)), _zeros(numbers), jnp.zeros_like(taped.t0)

@@ -304,9 +304,7 @@ def _storage(pattern: csr_array, by_rate: csr_array, transversal: list[int], piv
     rows, columns = pattern.nonzero()
     sparse = Sparse(rows, columns, pairing, _is_in(by_rate, rows, columns))
     cost = PIVOTED_COST if pivots else SPARSE_COST
-    if n > NEVER_DENSE:
-        return sparse
-    return sparse if cost * sparse.symbolic.cost <= n**3 / 3 else Dense(n)
+    return sparse if n > NEVER_DENSE or cost * sparse.symbolic.cost <= n**3 / 3 else Dense(n)
 
 
 def _compression(pattern: csr_array, storage: Storage) -> Compression:

@@ -67,12 +67,6 @@ class GMRES:
             if number is not None and not (isinstance(number, int | float) and 0 < number < np.inf):
                 raise ValueError(f"`{name}` must be a positive number, but is {number!r}.")
 
-    def describe(self) -> str:
-        """In words."""
-        return "GMRES with " + (
-            "incomplete factors" if self.preconditioner is None else "the preconditioner that is given"
-        )
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Iterative:
@@ -94,7 +88,8 @@ class Iterative:
 
     def describe(self) -> str:
         """In words."""
-        return f"{self.method.describe()}, {self.size:,} unknowns, {len(self._at[0]):,} entries"
+        by = "incomplete factors" if self.method.preconditioner is None else "the preconditioner that is given"
+        return f"GMRES with {by}, {self.size:,} unknowns, {len(self._at[0]):,} entries"
 
     def positions(self) -> Any:
         """Row and column of each entry."""
@@ -145,7 +140,6 @@ class Iterative:
     def solve(self, factors: PyTree, b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
         """x with A x = b, NaN where it is not found; A's derivative is that of the equation."""
         entries, scale, preconditioner = factors
-        rows, columns, _ = self._at
         at_hand = lax.stop_gradient(entries)
         b = (b * scale).astype(jnp.result_type(entries, b))
         rtol = self.method.rtol or float(jnp.finfo(b.dtype).eps) ** LEFT
@@ -157,10 +151,8 @@ class Iterative:
             return jax.linear_transpose(usual, x)(x)[0] if transposed else usual(x)
 
         def found(b: Array, transposed: bool) -> Array:
-            of, into = (columns, rows) if not transposed else (rows, columns)
-            apply = lambda x: jax.ops.segment_sum(at_hand * x[of], into, self.size)
             x, well = gmres(
-                apply,
+                functools.partial(self._product, at_hand, transposed=transposed),
                 functools.partial(precondition, transposed=transposed),
                 b,
                 rtol=rtol,
@@ -170,11 +162,17 @@ class Iterative:
             return jnp.where(well, x, jnp.nan)
 
         return lax.custom_linear_solve(
-            lambda x: jax.ops.segment_sum(entries * x[columns], rows, self.size),
+            functools.partial(self._product, entries),
             b,
             solve=lambda _, b: found(b, False),
             transpose_solve=lambda _, b: found(b, True),
         )
+
+    def _product(self, entries: Array, x: Array, transposed: bool = False) -> Array:
+        """A x or Aᵀ x, by the entries inside the matrix."""
+        rows, columns, _ = self._at
+        of, into = (rows, columns) if transposed else (columns, rows)
+        return jax.ops.segment_sum(entries * x[of], into, self.size)
 
     def apply(self, a: Inexact[Array, "*stored"], x: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
         """A x."""

@@ -63,13 +63,10 @@ def _parts(x: Any, seen: dict[int, object]) -> Iterator[bytes]:
     elif isinstance(x, types.FunctionType):
         seen[id(x)] = x
         cells = [cell.cell_contents for cell in x.__closure__ or ()]
-        named = [x.__globals__.get(name) for name in x.__code__.co_names]
+        read = map(x.__globals__.get, x.__code__.co_names)
         # Of functions those of the same module: a library's have caches.
-        named = [
-            value
-            for value in named
-            if isinstance(value, NUMBERS) or getattr(value, "__globals__", None) is x.__globals__
-        ]
+        own = lambda value: getattr(value, "__globals__", None) is x.__globals__
+        named = [value for value in read if isinstance(value, NUMBERS) or own(value)]
         yield from _parts((x.__code__, x.__defaults__ or (), x.__kwdefaults__ or {}, cells, named), seen)
     elif isinstance(x, functools.partial):
         yield from _parts((x.func, x.args, x.keywords), seen)
