@@ -171,6 +171,22 @@ def test_a_circuit_of_200_nodes():
     assert (found.index, found.degrees_of_freedom, found.regular) == (1, 100, True)
 
 
+def test_redundant_constraints_leave_more_freedom_than_the_count_says():
+    """A pendulum whose constraint is there twice: by the count it cannot move."""
+    force, twice = (
+        lambda t, q, v, args: jnp.array([0.0, -9.81]),
+        lambda t, q, args: jnp.stack([q @ q - 1, 2 * (q @ q - 1)]),
+    )
+    found = dae_jax.analyse(dae_jax.ConstrainedSystem(force, twice), 0.0, (jnp.array([1.0, 0.0]), jnp.zeros(2)))
+    assert "index 3 or higher, 0 degrees of freedom of the mechanism (0 initial values to choose) by the count" in str(
+        found
+    )
+    assert "`explain` says how many are independent" in str(found)
+    table = found._repr_html_().partition("<details")[0]
+    assert "3 or higher" in table
+    assert "0, of the mechanism, by the count of equations" in table
+
+
 def test_a_singular_jacobian_behind_a_regular_structure_is_found():
     """The multiple is the state's: y₂ · first − y₁ · second has no derivative, so that the index is 1 and not 0."""
     found = dae_jax.analyse(implicit(hidden), 0.0, jnp.ones(2))
