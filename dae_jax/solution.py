@@ -64,7 +64,8 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
     not_finite = (
         "The solution is not finite: the force, the mass matrix or a constraint returned NaN or infinity, a mass became "
-        "negative, the constraints became dependent, or the steps are too large for the method."
+        "negative, the constraints became dependent, or the steps are too large for the method, or to tell the roots of an "
+        "algebraic equation apart (smaller tolerances)."
     )
     times_outside = (
         "A time to save at (`saveat.ts`) lies outside of t0 to t1, if only by round-off: nothing is known there. Make t1 the last "

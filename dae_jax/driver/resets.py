@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 NO_COUNTS = ("max_steps", "end_time")
 # Of a condition's terms, in units of their last digit: what may be round-off of it.
 ROUND_OFF = 1000
+# By so many tolerances a condition may be off on its way off zero; for no more than this part of the solve's interval.
+ERRORS, SAME = 100, 1e-3
 
 
 class Reset(eqx.Module):
@@ -92,15 +94,19 @@ def Jump(
 
 
 class _FromStart(eqx.Module):
-    """± a condition whose value at the start is given."""
+    """± a condition whose value at the start is given, and is so for as long as it may be `off` by this."""
 
     condition: Callable[..., Any]
     sign: Any
     t0: Any
     level: Any
+    off: Any
+    near: Any
 
     def __call__(self, t: Time, y: Y, args: PyTree, **kwargs: object) -> Any:
-        return self.sign * jnp.where(t == self.t0, self.level, self.condition(t, y, args, **kwargs))
+        value = self.condition(t, y, args, **kwargs)
+        unknown = (jnp.abs(value) <= self.off) & (jnp.abs(t - self.t0) <= self.near)
+        return self.sign * jnp.where((t == self.t0) | unknown, self.level, value)
 
 
 class _Progress(NamedTuple):
@@ -149,15 +155,19 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Any]:
     numbers, others = eqx.partition(args, _is_number)
     # In which the order of resets is round-off.
     together = 16 * float(jnp.finfo(t0.dtype).eps) ** 0.75 * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+    tolerance = sum(jnp.max(jnp.asarray(getattr(solve.controller, x, 0.0), t0.dtype)) for x in ("rtol", "atol")) / 2
     going = int(RESULTS.event_occurred._value)
 
     def part(p: _Progress) -> tuple[DAESolution, Any]:
         args = eqx.combine(p.args, others)
-        level = _level_at_start(system, reset.condition, sign, p.t, p.y, args, p.level, rank, together, p.moved)
+        level, off, near = _level_at_start(
+            system, reset.condition, sign, p.t, p.y, args, p.level, rank, together, p.moved, ERRORS * tolerance
+        )
+        near = jnp.minimum(near, SAME * jnp.abs(t1 - t0))
         # A downcrossing, as bisection has to know which way it goes.
         up = {True: -1, False: 1, None: jnp.sign(level)}[reset.direction]
         event = diffrax.Event(
-            _FromStart(reset.condition, jnp.asarray(up, t0.dtype), p.t, level),
+            _FromStart(reset.condition, jnp.asarray(up, t0.dtype), p.t, level, off, near),
             Bracket(0.0, 0.0, flip=True),
             direction=False,
         )
@@ -195,7 +205,7 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Any]:
     unknown = jnp.zeros_like(t0)
     none: Any = None
     shape = jax.eval_shape(
-        part, _Progress(t0, y0, numbers, none, none, none, none, none, none, none, unknown, unknown)
+        part, _Progress(t0, y0, numbers, jnp.zeros((), int), none, none, none, none, none, none, unknown, unknown)
     )[0]
     unsaved = jax.tree.map(lambda x: jnp.full(x.shape, jnp.inf, x.dtype), shape.ys["wanted"])
     stats = {k: jnp.zeros((), int) for k in shape.stats if k not in NO_COUNTS}
@@ -263,10 +273,12 @@ def _level_at_start(
     rank: int | Rank | None,
     together: Scalar,
     moved: Scalar,
+    error: Scalar,
 ) -> Any:
     """The condition at the start of a part; where this is zero, the sign with which it leaves zero, forwards or, with `sign` −1,
     backwards. That is the sign with which it came, −`before`, where its rate is not known. Zero is what the condition moves by
-    while times are `together`, what may be round-off of the state in it, and what it has `moved` by.
+    while times are `together`, what may be round-off of the state in it, and, where it has `moved`, what it is off by: that and the
+    `error` of the state, relative to 1 and to it. And what it is off by, and for how long it may not have left zero by as much.
     """
     value = jnp.asarray(condition(t, y, args))
     # The state as it is: one made anew from the underlying ODE is NaN where the structure allows what the numbers do not.
@@ -277,6 +289,14 @@ def _level_at_start(
     slopes = jax.tree.leaves(jax.grad(of, 1)(t, z))
     terms = sum(jnp.sum(jnp.abs(slope * x)) for slope, x in zip(slopes, jax.tree.leaves(z), strict=True))
     round_off = ROUND_OFF * jnp.finfo(t.dtype).eps * jnp.where(jnp.isfinite(terms), terms, 0)
-    zero = jnp.abs(rate) * together + round_off + 2 * moved
+    # Where the state had to be made consistent it is off by its error, and will be: algebraic unknowns included.
+    slopes = jax.grad(lambda y: jnp.asarray(condition(t, y, args), t.dtype))(y)
+    error = error * sum(
+        jax.tree.leaves(jax.tree.map(lambda slope, x: jnp.sum(jnp.abs(slope) * (1 + jnp.abs(x))), slopes, y))
+    )
+    off = jnp.where(moved > round_off, 2 * moved + error, 0)
+    zero = jnp.abs(rate) * together + round_off + off
     leaves = (jnp.abs(value) <= zero) & (rate != 0)
-    return lax.stop_gradient(jnp.where(leaves, jnp.where(rate > 0, zero, -zero), value))
+    level = jnp.where(leaves, jnp.where(rate > 0, zero, -zero), value)
+    near = jnp.where(leaves, 2 * off / jnp.where(leaves, jnp.abs(rate), 1), 0)
+    return lax.stop_gradient((level, off, near))

@@ -278,8 +278,11 @@ class StructuralODE(ManifoldODE):
         return y + jnp.sum(normals * mu[:, None], 0)
 
     def retract_along(
-        self, t: Time, y: Float[Array, " N"], normals: Float[Array, "m N"]
+        self, t: Time, y: Float[Array, " N"], normals: Float[Array, "m N"], bend: float | None = None
     ) -> tuple[Any, Bool[Array, ""]]:
+        """`bend`: found only if Newton's first correction misses no more than this part of the way, as it does where
+        another root is as near.
+        """
         if not len(normals):
             return y, jnp.asarray(True)
         noise, amplified = OFF * float(jnp.finfo(y.dtype).eps), amplified_roundoff(y.dtype)
@@ -295,7 +298,17 @@ class StructuralODE(ManifoldODE):
                 settled = jnp.all(jnp.abs(off) <= noise * row_products(jnp.abs(across), jnp.abs(here)[None])[:, 0])
                 return mu - delta, jnp.where(settled & (size < amplified), 0, size)
 
-            return fixed_point(correct, jnp.zeros(len(normals), y.dtype))
+            start = jnp.zeros(len(normals), y.dtype)
+            if bend is None:
+                return fixed_point(correct, start)
+
+            def also_first(both: tuple[Float[Array, " m"], Float[Array, " m"]]) -> tuple[Any, Any]:
+                (mu, size), first = correct(both[0]), both[1]
+                return (mu, jnp.where(jnp.any(first != 0), first, mu)), size
+
+            (mu, first), found = fixed_point(also_first, (start, start))
+            length = lambda mu: jnp.max(jnp.abs(ode.displace(0, normals, mu)))
+            return mu, found & (length(mu - first) <= bend * length(mu) + amplified)
 
         residual = lambda mu, params: params[0].violations(params[1], params[0].displace(params[2], params[3], mu))
         mu, found = implicit_root(residual, iterate, (self, t, y, normals))

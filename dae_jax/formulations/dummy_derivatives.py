@@ -22,6 +22,10 @@ class DummyDerivatives(AbstractFieldFormulation):
     (y, ẏ, …) that are not integrated but found from the equations: at each stage of an explicit solver by Newton's method, by
     `RadauIIA5` and `BDF`, for stiff systems, as the algebraic variables of a system of index 1.
 
+    Where an algebraic equation has several roots, the one is followed that the motion from the start leads to: an explicit solver
+    begins Newton's method at the integral of their derivatives, and rejects a step from which another root is about as near. Where
+    roots meet, the solve ends with an error.
+
     Which ones is decided level by level, by complete pivoting on the system Jacobian at the start, and again at any step at
     which the choice has become worse than the best by more than a factor (hysteresis), inside one compiled solve: nothing
     is stopped or started anew. `stats["switches"]` counts the changes. A pendulum, for one, is

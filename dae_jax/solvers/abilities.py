@@ -16,13 +16,13 @@ def economical(solver: diffrax.AbstractSolver, between: bool) -> Any:
     """The solver without what a solve does not need, with its stages written out; `between`: points between steps are asked
     for.
     """
-    fields = {field.name for field in dataclasses.fields(solver)}
-    if "dense" in fields:
-        return dataclasses.replace(solver, dense=between)
+    changed: dict[str, Any] = {}
+    if any(field.name == "dense" for field in dataclasses.fields(solver)):
+        changed["dense"] = between
     inner = getattr(solver, "solver", None)
     if inner is not None and isinstance(solver, AbstractManifoldSolver | AbstractResidualSolver):
-        return dataclasses.replace(solver, solver=economical(inner, between))
-    return unrolled(solver)
+        changed["solver"] = economical(inner, between)
+    return dataclasses.replace(solver, **changed) if changed else unrolled(solver)
 
 
 def is_explicit(solver: diffrax.AbstractSolver) -> bool:

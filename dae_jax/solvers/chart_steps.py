@@ -1,5 +1,6 @@
 """Steps of an explicit solver in a chart of the manifold, from whose points a direction leads back on to it."""
 
+import abc
 from typing import Any, ClassVar
 
 import diffrax
@@ -8,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from ..types import BoolLike, Time
+from ..types import BoolLike, Time, Y
 from ..validate.states import brief
 from .abilities import is_explicit
 from .explicit import identity, unrolled
@@ -19,8 +20,8 @@ from .manifold import AbstractManifoldSolver, or_nan, outcome, time_sign
 SPEEDS = 10
 
 
-class TangentPoint(eqx.Module):
-    """A point of the tangent space at a step's start, with the normals there."""
+class ChartPoint(eqx.Module):
+    """A point of a step's chart, with the directions that lead back on to the manifold."""
 
     y: Any
     normals: Any
@@ -36,11 +37,14 @@ class _Interpolation(diffrax.AbstractLocalInterpolation):
     def evaluate(self, t0: Time, t1: Any = None, left: bool = True) -> Any:
         if t1 is not None:
             return jax.tree.map(lambda a, b: b - a, self.evaluate(t0), self.evaluate(t1))
-        return TangentPoint(self.cls(t0=self.t0, t1=self.t1, **self.inner).evaluate(t0), self.normals)
+        return ChartPoint(self.cls(t0=self.t0, t1=self.t1, **self.inner).evaluate(t0), self.normals)
 
 
 class AbstractChartSolver(AbstractManifoldSolver, diffrax.AbstractAdaptiveSolver):
-    """A step of `solver`, an explicit one, in a chart: `step_in`. Between steps, points of the chart go on to the manifold."""
+    """A step of `solver`, an explicit one, in a chart: `step_in`. Between steps, points of the chart go on to the manifold.
+
+    A chart gives a point u of its own the one on the manifold, `lift`, and a derivative ẏ that of u, `along`.
+    """
 
     solver: diffrax.AbstractSolver
 
@@ -62,6 +66,14 @@ class AbstractChartSolver(AbstractManifoldSolver, diffrax.AbstractAdaptiveSolver
     def interpolation_cls(self) -> Any:
         inner = self.solver.interpolation_cls
         return lambda t0, t1, inner_info, normals: _Interpolation(t0, t1, inner_info, normals, inner)
+
+    @abc.abstractmethod
+    def along(self, dy: Y, chart: Any, ode: Any) -> Any:
+        """u̇ of ẏ."""
+
+    def lift(self, t: Time, u: Y, chart: Any, ode: Any, between: bool = False) -> Any:
+        """The point y of the manifold at time t that u, a stage's or one `between` steps, stands for, and whether it was found."""
+        return ode.retract_along(t, u, chart)
 
     def order(self, terms: diffrax.AbstractTerm) -> Any:
         return self.solver.order(terms)
@@ -85,12 +97,12 @@ class AbstractChartSolver(AbstractManifoldSolver, diffrax.AbstractAdaptiveSolver
         solver: Any = unrolled(self.solver)
 
         # The end of the step is the lift of the last stage's point; its derivative is the next step's first.
-        tangent_term = diffrax.ODETerm(lambda t, u, _: _field(terms, sign, args, chart, t, u)[0])
-        first = args.tangent(derivative, chart) if made_jump is False else None
+        tangent_term = diffrax.ODETerm(lambda t, u, _: self._field(terms, sign, args, chart, t, u))
+        first = self.along(derivative, chart, args) if made_jump is False else None
         first = tangent_term.vf(t0, y0, None) if first is None else first
         wrapped = _Controlled(tangent_term, terms)
         u1, error, dense, _, _ = solver.step_and_retract(wrapped, t0, t1, y0, None, first, False, identity)
-        y1, found = args.retract_along(sign * t1, u1, chart)
+        y1, found = self.lift(sign * t1, u1, chart, args)
         y1 = or_nan(found, y1)
         end = terms.vf(t1, y1, args)
         if error is not None:
@@ -99,14 +111,18 @@ class AbstractChartSolver(AbstractManifoldSolver, diffrax.AbstractAdaptiveSolver
         return y1, error, info, end, outcome(found)
 
     def retract(self, t: Any, y: Any, ode: Any) -> Any:
-        if not isinstance(y, TangentPoint):
+        if not isinstance(y, ChartPoint):
             return y
-        y, found = ode.retract_along(t, y.y, y.normals)
+        y, found = self.lift(t, y.y, y.normals, ode, between=True)
         return or_nan(found, y)
 
     def whole_path(self, path: diffrax.DenseInterpolation) -> diffrax.DenseInterpolation:
-        first = TangentPoint(path.y0_if_trivial, jax.tree.map(lambda x: x[0], path.infos["normals"]))
+        first = ChartPoint(path.y0_if_trivial, jax.tree.map(lambda x: x[0], path.infos["normals"]))
         return eqx.tree_at(lambda p: p.y0_if_trivial, path, first)
+
+    def _field(self, terms: diffrax.AbstractTerm, sign: Any, ode: Any, chart: Any, t: Any, u: Any) -> Any:
+        y, found = self.lift(sign * t, u, chart, ode)
+        return or_nan(jnp.asarray(found), self.along(terms.vf(t, y, ode), chart, ode))
 
 
 class _Controlled(eqx.Module):
@@ -131,9 +147,3 @@ def _jumps(y0: Any, y1: Any, start: Any, end: Any, h: Any) -> Any:
     largest = lambda x: jnp.max(jnp.abs(x))
     allowed = float(jnp.finfo(y0.dtype).eps) ** 0.5 * (1 + largest(y1))
     return largest(y1 - y0) > allowed + SPEEDS * jnp.abs(h) * (largest(start) + largest(end))
-
-
-def _field(terms: diffrax.AbstractTerm, sign: Any, ode: Any, chart: Any, t: Any, u: Any) -> Any:
-    y, found = ode.retract_along(sign * t, u, chart)
-    dy = ode.tangent(terms.vf(t, y, ode), chart)
-    return or_nan(jnp.asarray(found), dy), y

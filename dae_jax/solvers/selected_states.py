@@ -8,12 +8,22 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from ..equations.structural_ode import StructuralODE
 from ..linalg import row_products, solve
-from ..types import BoolLike, Time
+from ..types import BoolLike, Time, Y
 from .chart_steps import AbstractChartSolver
 from .manifold import or_nan, outcome, time_sign
 from .replay import Replayable
 from .residual_steps import AbstractResidualSolver, constant
+
+
+# Of the way to a root, what Newton's first correction may miss: half of it and more where another root is as near. At the stages
+# less, as a step that leaps over roots comes near one by chance.
+NEAREST, STRAIGHT = 0.5, 0.05
+# Of the terms of an equation, in units of their last digit: what may be round-off of it.
+ROUND_OFF = 1000
+# Where in a step, for what is asked for between steps, it is looked at too.
+WITHIN = (0.3, 0.7)
 
 
 class Selection(NamedTuple):
@@ -29,7 +39,13 @@ class Selection(NamedTuple):
 class SelectedStates(Replayable, AbstractChartSolver):
     """A step of an explicit solver in some entries of the state, its *states*; the others, as many as there are
     constraints, are found from H(t, y) = 0 by Newton's method at each stage. Used by `DummyDerivatives`, which see.
+
+    Of several roots the one is meant that the motion leads to: Newton's method starts from the integral of the others' own
+    derivatives, and a step from which another root could be reached is done again with a smaller one. `dense` says whether
+    points between steps are asked for, which are found likewise.
     """
+
+    dense: bool = True
 
     recomputable: ClassVar[bool] = False
     counts: ClassVar[tuple[str, ...]] = ("switches",)
@@ -56,14 +72,32 @@ class SelectedStates(Replayable, AbstractChartSolver):
             sign = time_sign(terms, t0, t1)
             before, after = args.orientation(sign * t0, y0, directions), args.orientation(sign * t1, y1, directions)
             stays = jnp.all(before * after > 0)
+            if self.dense:
+                stays &= self._is_found_within(sign, t0, t1, dense, args)
+            normals = args.normals(sign * t1, y1)
+            if error is not None:
+                stays &= _leads_back(args, sign * t1, y1, error, normals, directions)
             y1, error = or_nan(stays, y1), None if error is None else or_nan(stays, error)
             result = diffrax.RESULTS.where(stays, result, outcome(stays))
             if error is not None:
                 # Entries that are not integrated are off by what follows from the error of the others.
-                normals = args.normals(sign * t1, y1)
                 follows = solve(row_products(normals, directions), jnp.sum(normals * error, 1))
                 error = error - jnp.sum(directions * follows[:, None], 0)
         return y1, error, dense, Selection(derivative, directions, solver_state.switches + switched), result
+
+    def along(self, dy: Y, chart: Any, ode: StructuralODE) -> Any:
+        return dy
+
+    def lift(self, t: Time, u: Y, chart: Any, ode: StructuralODE, between: bool = False) -> Any:
+        return ode.retract_along(t, u, chart, NEAREST if between else STRAIGHT)
+
+    def _is_found_within(self, sign: Any, t0: Time, t1: Time, dense: Any, ode: StructuralODE) -> Any:
+        path, found = self.interpolation_cls(t0=t0, t1=t1, **dense), []
+        for part in WITHIN:
+            t = t0 + part * (t1 - t0)
+            point = path.evaluate(t)
+            found.append(self.lift(sign * t, point.y, point.normals, ode)[1])
+        return jnp.all(jnp.stack(found))
 
     def replay(
         self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any, history: Any, dense: Any
@@ -71,6 +105,20 @@ class SelectedStates(Replayable, AbstractChartSolver):
         derivative = terms.vf(t0, y0, args)
         y1, _, dense, *_ = self.step_in(dense["normals"], terms, t0, t1, y0, args, derivative, False)
         return y1, history, dense
+
+
+def _leads_back(ode: StructuralODE, t: Time, y: Any, error: Any, normals: Any, directions: Any) -> Any:
+    """Whether Newton's method leads back to y from as far off as the error, or as round-off, to either side."""
+    matrix = row_products(normals, directions)
+    terms = row_products(jnp.abs(normals), jnp.abs(y)[None])[:, 0]
+    round_off = ROUND_OFF * float(jnp.finfo(y.dtype).eps) * jnp.abs(solve(matrix, terms))
+    off = jnp.abs(jnp.sum(directions * error, 1)) + round_off
+    found = []
+    for side in (1, -1):
+        beside = y + side * jnp.sum(directions * off[:, None], 0)
+        missed = side * off - solve(matrix, ode.violations(t, beside))
+        found.append(jnp.max(jnp.abs(missed)) <= NEAREST * jnp.max(off))
+    return jnp.all(jnp.stack(found))
 
 
 class SelectedResiduals(Replayable, AbstractResidualSolver):

@@ -33,6 +33,9 @@ class TangentSpace(AbstractChartSolver):
     def init(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Y, args: ManifoldODE) -> Any:
         return terms.vf(t0, y0, args)
 
+    def along(self, dy: Y, chart: Any, ode: ManifoldODE) -> Any:
+        return ode.tangent(dy, chart)
+
     def step(
         self,
         terms: diffrax.AbstractTerm,

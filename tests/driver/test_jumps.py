@@ -405,3 +405,37 @@ def test_bisection_of_several_conditions_is_refused():
     decay = dae_jax.ImplicitDAE(lambda t, y, yd, args: yd + y)
     with pytest.raises(ValueError, match="finds the first of several events by"):
         dae_jax.daesolve(decay, dae_jax.RadauIIA5(), 0.0, 3.0, None, jnp.ones(1), event=event)
+
+
+# cos 7t is given, its derivative or what it is the derivative of is found.
+GIVEN = {
+    "given": (lambda t, y, yd, a: [yd[1] - y[0], y[1] - jnp.cos(7 * t)], jnp.array([0.0, 1.0])),
+    "found": (lambda t, y, yd, a: [yd[0] + 7 * y[1], y[0] + jnp.sin(7 * t)], jnp.array([0.0, 1.0])),
+}
+RESIDUAL_SOLVERS = (dae_jax.BDF, dae_jax.RadauIIA5, dae_jax.RadauIIA9, dae_jax.RadauIIA13, dae_jax.Radau)
+
+
+@pytest.mark.parametrize("direction", [None, True, False])
+@pytest.mark.parametrize("name", GIVEN)
+@pytest.mark.parametrize("solver", RESIDUAL_SOLVERS)
+def test_one_crossing_is_one_reset(solver, name, direction):
+    """The state after a reset is off by the tolerance, and may be on the side that it came from."""
+    equations, start = GIVEN[name]
+    t = np.pi / 21 * np.array([1, 5, 7, 11, 13, 17, 19])
+    exact = {None: t, True: t[1::2], False: t[::2]}[direction]
+    event = dae_jax.Reset(lambda t, y, a, **k: y[1] - 0.5, lambda t, y, a: (y, a), direction)
+    for tolerance in (1e-3, 1e-4, 1e-6, 1e-8):
+        controller = diffrax.PIDController(rtol=tolerance, atol=tolerance)
+        sol = dae_jax.daesolve(
+            dae_jax.ImplicitDAE(equations),
+            solver(),
+            0.0,
+            3.0,
+            None,
+            start,
+            stepsize_controller=controller,
+            event=event,
+            max_steps=100_000,
+        )
+        assert sol.stats["jumps"] == len(exact)
+        assert np.abs(sol.stats["jump_times"][: len(exact)] - exact).max() < 10 * tolerance
