@@ -94,8 +94,16 @@ BREAKS = {
         "tests/solvers/test_methods.py::test_symmetric_projection_goes_back_to_where_it_came_from",
     ),
     "chart: time of the stages backwards": Break(
-        "solvers/chart_steps.py", "ode.retract_along(sign * t, u, chart)", "ode.retract_along(t, u, chart)",
+        "solvers/chart_steps.py", "self.lift(sign * t, u, chart, ode)", "self.lift(t, u, chart, ode)",
         f"{_BACKWARDS}[solver1]",
+    ),
+    "roots: any that Newton's method finds": Break(
+        "equations/structural_ode.py", "<= bend * length(mu) + amplified", "<= 1e9 * length(mu) + amplified",
+        "tests/solvers/test_roots.py::test_the_end_is_on_the_root_of_the_start[joint-tsit5]",
+    ),
+    "resets: a state as good as exact": Break(
+        "driver/reset_levels.py", "& (jnp.abs(t - self.t0) <= self.near)", "& (t == self.t0)",
+        "tests/driver/test_jumps.py::test_one_crossing_is_one_reset[RadauIIA5-given-False]",
     ),
     "projection: time backwards": Break(
         "solvers/orthogonal_projection.py", "args.project(sign * t, y)", "args.project(t, y)", f"{_BACKWARDS}[solver0]"

@@ -16,14 +16,13 @@ from .._compat import while_loop
 from ..compiler import one_kernel
 from ..compiler.types import Arrays
 from ..consistent import consistent_state
-from ..equations.constraint_jacobian import Rank
-from ..equations.flow import flow
 from ..solution import RESULTS, DAESolution, precision_of
 from ..systems import System
-from ..types import Args, Scalar, State, Time, Y
+from ..types import Args, Scalar, State, Time
 from ..validate.states import NUMBERS, brief
 from .bracket import Bracket
 from .problem import Problem, Split, count_of, split
+from .reset_levels import FromStart, level_at_start
 from .start import saved_parts
 
 
@@ -33,8 +32,6 @@ if TYPE_CHECKING:
 
 # Entries of `stats` that do not add up over the parts of a solve.
 NO_COUNTS = ("max_steps", "end_time")
-# Of a condition's terms, in units of their last digit: what may be round-off of it.
-ROUND_OFF = 1000
 # By so many tolerances a condition may be off on its way off zero; for no more than this part of the solve's interval.
 ERRORS, SAME = 100, 1e-3
 
@@ -93,22 +90,6 @@ def Jump(
     return Reset(condition, jump, direction, fixed, most)
 
 
-class _FromStart(eqx.Module):
-    """± a condition whose value at the start is given, and is so for as long as it may be `off` by this."""
-
-    condition: Callable[..., Any]
-    sign: Any
-    t0: Any
-    level: Any
-    off: Any
-    near: Any
-
-    def __call__(self, t: Time, y: Y, args: PyTree, **kwargs: object) -> Any:
-        value = self.condition(t, y, args, **kwargs)
-        unknown = (jnp.abs(value) <= self.off) & (jnp.abs(t - self.t0) <= self.near)
-        return self.sign * jnp.where((t == self.t0) | unknown, self.level, value)
-
-
 class _Progress(NamedTuple):
     """Where a solve stands: the start of the next part, what was saved so far, `changed` of the args beside, and how the last part
     ended; `level` is the condition at the start of the last part, `moved` by how much making the state after the last reset consistent
@@ -155,19 +136,20 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Any]:
     numbers, others = eqx.partition(args, _is_number)
     # In which the order of resets is round-off.
     together = 16 * float(jnp.finfo(t0.dtype).eps) ** 0.75 * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
-    tolerance = sum(jnp.max(jnp.asarray(getattr(solve.controller, x, 0.0), t0.dtype)) for x in ("rtol", "atol")) / 2
+    tolerances = [jnp.max(jnp.asarray(getattr(solve.controller, x, 0.0), t0.dtype)) for x in ("rtol", "atol")]
+    error = ERRORS * jnp.maximum(*tolerances)
     going = int(RESULTS.event_occurred._value)
 
     def part(p: _Progress) -> tuple[DAESolution, Any]:
         args = eqx.combine(p.args, others)
-        level, off, near = _level_at_start(
-            system, reset.condition, sign, p.t, p.y, args, p.level, rank, together, p.moved, ERRORS * tolerance
+        level, off, near = level_at_start(
+            system, reset.condition, sign, p.t, p.y, args, p.level, rank, together, p.moved, error
         )
         near = jnp.minimum(near, SAME * jnp.abs(t1 - t0))
         # A downcrossing, as bisection has to know which way it goes.
         up = {True: -1, False: 1, None: jnp.sign(level)}[reset.direction]
         event = diffrax.Event(
-            _FromStart(reset.condition, jnp.asarray(up, t0.dtype), p.t, level, off, near),
+            FromStart(reset.condition, jnp.asarray(up, t0.dtype), p.t, level, off, near),
             Bracket(0.0, 0.0, flip=True),
             direction=False,
         )
@@ -260,43 +242,3 @@ def _after(system: System, reset: Reset, t: Time, y: State, args: Args) -> tuple
     numbers = (eqx.filter(a, _is_number) for a in (new, args))
     after = jax.tree.map(lambda x, like: jnp.asarray(x, jnp.result_type(like)), *numbers)
     return y, after, lax.stop_gradient(jnp.asarray(moved, jnp.result_type(t)))
-
-
-def _level_at_start(
-    system: System,
-    condition: Callable[..., Time],
-    sign: Scalar,
-    t: Scalar,
-    y: State,
-    args: Args,
-    before: Scalar,
-    rank: int | Rank | None,
-    together: Scalar,
-    moved: Scalar,
-    error: Scalar,
-) -> Any:
-    """The condition at the start of a part; where this is zero, the sign with which it leaves zero, forwards or, with `sign` −1,
-    backwards. That is the sign with which it came, −`before`, where its rate is not known. Zero is what the condition moves by
-    while times are `together`, what may be round-off of the state in it, and, where it has `moved`, what it is off by: that and the
-    `error` of the state, relative to 1 and to it. And what it is off by, and for how long it may not have left zero by as much.
-    """
-    value = jnp.asarray(condition(t, y, args))
-    # The state as it is: one made anew from the underlying ODE is NaN where the structure allows what the numbers do not.
-    z, decode, zd = flow(system, t, y, args, rank)
-    of = lambda t, z: jnp.asarray(condition(t, decode(t, z), args), t.dtype)
-    _, rate = jax.jvp(of, (t, z), (jnp.ones_like(t), zd))
-    rate = jnp.where(jnp.isfinite(rate), sign * rate, -before)
-    slopes = jax.tree.leaves(jax.grad(of, 1)(t, z))
-    terms = sum(jnp.sum(jnp.abs(slope * x)) for slope, x in zip(slopes, jax.tree.leaves(z), strict=True))
-    round_off = ROUND_OFF * jnp.finfo(t.dtype).eps * jnp.where(jnp.isfinite(terms), terms, 0)
-    # Where the state had to be made consistent it is off by its error, and will be: algebraic unknowns included.
-    slopes = jax.grad(lambda y: jnp.asarray(condition(t, y, args), t.dtype))(y)
-    error = error * sum(
-        jax.tree.leaves(jax.tree.map(lambda slope, x: jnp.sum(jnp.abs(slope) * (1 + jnp.abs(x))), slopes, y))
-    )
-    off = jnp.where(moved > round_off, 2 * moved + error, 0)
-    zero = jnp.abs(rate) * together + round_off + off
-    leaves = (jnp.abs(value) <= zero) & (rate != 0)
-    level = jnp.where(leaves, jnp.where(rate > 0, zero, -zero), value)
-    near = jnp.where(leaves, 2 * off / jnp.where(leaves, jnp.abs(rate), 1), 0)
-    return lax.stop_gradient((level, off, near))
