@@ -59,13 +59,13 @@ def solved(name: str, solver: diffrax.AbstractSolver, tolerance: float, **option
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("tolerance", [1e-4, 1e-6, 1e-9])
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("name", PROBLEMS)
-def test_every_saved_value_is_on_the_root_of_the_start(name: str, solver: str, tolerance: float) -> None:
-    sol = solved(name, SOLVERS[solver], tolerance, saveat=diffrax.SaveAt(ts=TS))
-    found, exact = np.asarray(sol.ys)[:, 1], PROBLEMS[name][2](np.asarray(TS))
-    assert np.abs(found - exact).max() < 1000 * tolerance
+def test_every_saved_value_is_on_the_root_of_the_start(name: str, solver: str) -> None:
+    exact = PROBLEMS[name][2](np.asarray(TS))
+    for tolerance in (1e-4, 1e-6, 1e-9):
+        sol = solved(name, SOLVERS[solver], tolerance, saveat=diffrax.SaveAt(ts=TS))
+        assert np.abs(np.asarray(sol.ys)[:, 1] - exact).max() < 1000 * tolerance
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
