@@ -187,7 +187,7 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Any]:
     unknown = jnp.zeros_like(t0)
     none: Any = None
     shape = jax.eval_shape(
-        part, _Progress(t0, y0, numbers, jnp.zeros((), int), none, none, none, none, none, none, unknown, unknown)
+        part, _Progress(t0, y0, numbers, none, none, none, none, none, none, none, unknown, unknown)
     )[0]
     unsaved = jax.tree.map(lambda x: jnp.full(x.shape, jnp.inf, x.dtype), shape.ys["wanted"])
     stats = {k: jnp.zeros((), int) for k in shape.stats if k not in NO_COUNTS}
