@@ -63,11 +63,9 @@ def level_at_start(
     terms = sum(jnp.sum(jnp.abs(slope * x)) for slope, x in zip(slopes, jax.tree.leaves(z), strict=True))
     round_off = ROUND_OFF * jnp.finfo(t.dtype).eps * jnp.where(jnp.isfinite(terms), terms, 0)
     # Where the state had to be made consistent it is off by its error, and will be: algebraic unknowns included.
-    slopes = jax.grad(lambda y: jnp.asarray(condition(t, y, args), t.dtype))(y)
-    error = error * sum(
-        jax.tree.leaves(jax.tree.map(lambda slope, x: jnp.sum(jnp.abs(slope) * (1 + jnp.abs(x))), slopes, y))
-    )
-    off = jnp.where(moved > round_off, 2 * moved + error, 0)
+    by_state = jax.grad(lambda y: jnp.asarray(condition(t, y, args), t.dtype))(y)
+    size = jax.tree.map(lambda slope, x: jnp.sum(jnp.abs(slope) * (1 + jnp.abs(x))), by_state, y)
+    off = jnp.where(moved > round_off, 2 * moved + error * sum(jax.tree.leaves(size)), 0)
     zero = jnp.abs(rate) * together + round_off + off
     leaves = (jnp.abs(value) <= zero) & (rate != 0)
     level = jnp.where(leaves, jnp.where(rate > 0, zero, -zero), value)

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ..equations.structural_ode import StructuralODE
+from ..equations.structural_ode import OFF, StructuralODE
 from ..linalg import row_products, solve
 from ..types import BoolLike, Time, Y
 from .chart_steps import AbstractChartSolver
@@ -20,8 +20,6 @@ from .residual_steps import AbstractResidualSolver, constant
 # Of the way to a root, what Newton's first correction may miss: half of it and more where another root is as near. At the stages
 # less, as a step that leaps over roots comes near one by chance.
 NEAREST, STRAIGHT = 0.5, 0.05
-# Of the terms of an equation, in units of their last digit: what may be round-off of it.
-ROUND_OFF = 1000
 # Where in a step, for what is asked for between steps, it is looked at too.
 WITHIN = (0.3, 0.7)
 
@@ -74,15 +72,13 @@ class SelectedStates(Replayable, AbstractChartSolver):
             stays = jnp.all(before * after > 0)
             if self.dense:
                 stays &= self._is_found_within(sign, t0, t1, dense, args)
-            normals = args.normals(sign * t1, y1)
             if error is not None:
+                normals = args.normals(sign * t1, y1)
                 stays &= _leads_back(args, sign * t1, y1, error, normals, directions)
-            y1, error = or_nan(stays, y1), None if error is None else or_nan(stays, error)
-            result = diffrax.RESULTS.where(stays, result, outcome(stays))
-            if error is not None:
                 # Entries that are not integrated are off by what follows from the error of the others.
                 follows = solve(row_products(normals, directions), jnp.sum(normals * error, 1))
-                error = error - jnp.sum(directions * follows[:, None], 0)
+                error = or_nan(stays, error - jnp.sum(directions * follows[:, None], 0))
+            y1, result = or_nan(stays, y1), diffrax.RESULTS.where(stays, result, outcome(stays))
         return y1, error, dense, Selection(derivative, directions, solver_state.switches + switched), result
 
     def along(self, dy: Y, chart: Any, ode: StructuralODE) -> Any:
@@ -111,7 +107,7 @@ def _leads_back(ode: StructuralODE, t: Time, y: Any, error: Any, normals: Any, d
     """Whether Newton's method leads back to y from as far off as the error, or as round-off, to either side."""
     matrix = row_products(normals, directions)
     terms = row_products(jnp.abs(normals), jnp.abs(y)[None])[:, 0]
-    round_off = ROUND_OFF * float(jnp.finfo(y.dtype).eps) * jnp.abs(solve(matrix, terms))
+    round_off = OFF * float(jnp.finfo(y.dtype).eps) * jnp.abs(solve(matrix, terms))
     off = jnp.abs(jnp.sum(directions * error, 1)) + round_off
     found = []
     for side in (1, -1):

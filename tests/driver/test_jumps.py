@@ -426,16 +426,7 @@ def test_one_crossing_is_one_reset(solver, name, direction):
     event = dae_jax.Reset(lambda t, y, a, **k: y[1] - 0.5, lambda t, y, a: (y, a), direction)
     for tolerance in (1e-3, 1e-4, 1e-6, 1e-8):
         controller = diffrax.PIDController(rtol=tolerance, atol=tolerance)
-        sol = dae_jax.daesolve(
-            dae_jax.ImplicitDAE(equations),
-            solver(),
-            0.0,
-            3.0,
-            None,
-            start,
-            stepsize_controller=controller,
-            event=event,
-            max_steps=100_000,
-        )
+        options = {"stepsize_controller": controller, "event": event, "max_steps": 100_000}
+        sol = dae_jax.daesolve(dae_jax.ImplicitDAE(equations), solver(), 0.0, 3.0, None, start, **options)
         assert sol.stats["jumps"] == len(exact)
         assert np.abs(sol.stats["jump_times"][: len(exact)] - exact).max() < 10 * tolerance

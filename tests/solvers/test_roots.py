@@ -85,10 +85,10 @@ def test_where_roots_meet_the_solve_ends(solver: str) -> None:
 
 def test_a_pendulum_keeps_its_side_at_loose_tolerances() -> None:
     system = D.ConstrainedSystem(lambda t, q, v, a: jnp.array([0.0, -9.81]), lambda t, q, a: (q @ q - 1) / 2)
-    angle = lambda t, y, a: y[0]
+    position = lambda t, y, a: y[0]
     sol = D.daesolve(
         system, diffrax.Tsit5(), 0.0, 3.0, None, (jnp.array([0.0, -1.0]), jnp.array([1.0, 0.0])),
-        formulation=D.DummyDerivatives(), saveat=diffrax.SaveAt(ts=TS, fn=angle),
+        formulation=D.DummyDerivatives(), saveat=diffrax.SaveAt(ts=TS, fn=position),
         stepsize_controller=diffrax.PIDController(rtol=1e-2, atol=1e-2),
     )  # fmt: skip
     assert (np.asarray(sol.ys)[:, 1] < -0.9).all()
