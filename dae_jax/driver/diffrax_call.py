@@ -29,6 +29,7 @@ from ..solvers import (
 from ..types import Time, Y
 from .bracket import bracketing
 from .crossings import OneCrossing, OnStates
+from .felt_steps import felt_steps
 from .followed_steps import RecordedEnds, at_steps, taken
 from .observed_steps import Observer, observed
 from .passages import passages
@@ -112,6 +113,8 @@ def call(solve: "Solve", problem: Problem, steps: Float[Array, " steps"] | None 
     switches = stepped_over(problem) if steps is None and not solve.recording else None
     if switches is not None:
         observers["switches"] = switches
+    if solve.felt and isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
+        controller = felt_steps(controller)
     controller = observed(controller if steps is None else at_steps(controller, steps), observers)
     saveat = dataclasses.replace(saveat, controller_state=True) if observers else saveat
     sol = diffrax.diffeqsolve(

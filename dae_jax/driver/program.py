@@ -25,6 +25,7 @@ from ..validate.user_functions import refuse_wrong_functions, returned
 from .diffrax_call import Decode, View, call
 from .ends import look
 from .event_functions import refuse_wrong_event
+from .felt_steps import some_change
 from .outcome import judged
 from .problem import Problem, Program, Split, split
 from .resets import Reset, solve_with_resets
@@ -107,7 +108,7 @@ def run(program: Program, arrays: Arrays) -> tuple[DAESolution, Any, float]:
 @functools.partial(
     jax.tree_util.register_dataclass,
     data_fields=("formulation", "solver", "saveat", "controller", "adjoint", "event", "progress_meter"),
-    meta_fields=("max_steps", "recording"),
+    meta_fields=("max_steps", "recording", "felt"),
 )
 @dataclasses.dataclass(frozen=True, eq=False)
 class Solve:
@@ -123,6 +124,8 @@ class Solve:
     max_steps: int | None
     # Whether the dense output is there for the tape alone.
     recording: bool = False
+    # Whether the steps are those of a derivative, a program of its own.
+    felt: bool = False
 
     def __call__(self, problem: Problem) -> tuple[DAESolution, Any]:
         backwards = problem.t1 < problem.t0
@@ -214,8 +217,13 @@ class Solve:
                 recording = dataclasses.replace(
                     solve.forwards(), saveat=recorded(solve.saveat, replays(solve.solver)), recording=True
                 )
-                record, also_arrays = recording.kernel(problem)
-                _, _, ts, ys, interpolation, *_ = record(also_arrays).numbers
+
+                def record(y0: State) -> Any:
+                    numbers, also_arrays = recording.kernel(dataclasses.replace(problem, y0=y0))
+                    return numbers(also_arrays).numbers
+
+                # Along some change of the start, so that the steps are short enough for it too.
+                (_, _, ts, ys, interpolation, *_), _ = jax.jvp(record, (problem.y0,), (some_change(problem.y0),))
                 numbers, others = eqx.partition(arrays, eqx.is_inexact_array)
                 fixed: list[Any] = []
 
@@ -242,8 +250,9 @@ class Solve:
         return Taped(self.formulation, solver, part, problem.t0, problem.t1, problem.dt0, y, ode, view)
 
     def forwards(self) -> "Solve":
-        """The same solve with forward derivatives."""
-        return dataclasses.replace(self, adjoint=diffrax.ForwardMode())
+        """The same solve with forward derivatives, and with steps that are short enough for them."""
+        apart = self.derivative() == "reverse" and one_kernel_enabled()
+        return dataclasses.replace(self, adjoint=diffrax.ForwardMode(), felt=apart)
 
     def derivative(self) -> Any:
         """In which mode the adjoint allows derivatives; a progress meter needs callbacks."""

@@ -120,5 +120,5 @@ def _error(e5: Array, e3: Array, y0: Array, y1: Array) -> Any:
     weights = 1 / (1 + jnp.maximum(jnp.abs(y0), jnp.abs(y1))) ** 2
     five, three = jnp.sum(weights * e5**2), jnp.sum(weights * e3**2)
     ratio = five / (five + 0.01 * three + float(jnp.finfo(five.dtype).tiny))
-    # The derivative of the square root at 0 is infinite; an error of 0 needs none.
-    return e5 * jnp.sqrt(jnp.where(ratio > 0, ratio, 1)) * (ratio > 0)
+    # The derivative of the square root at 0 is infinite; that of an error of 0 is that of e₅.
+    return e5 * jnp.sqrt(jnp.where(ratio > 0, ratio, 1))
