@@ -91,10 +91,12 @@ def daesolve(
       after it. Derivatives are those of the numerical solution: where steps leap over a kink of a function (`abs`, `where`, `sort`)
       they are right to about the square root of the tolerance; make its time known (`jump_ts`), or a `Reset` of it. Where it jumps
       at a time that depends on what is differentiated, they lack that dependence, as the derivative of `where` does: a `Reset` has
-      it. Steps are chosen for the solution, not for its derivatives: where that rests, in an equilibrium, or moves steadily, they grow
-      beyond what the derivatives need, and a linearisation about such a motion wants steps of a part of its time scale (`dtmax` of
-      the controller, or `dt0`). Second derivatives are there in any order of modes, third ones with `jax.jacfwd` outside; with a
-      progress meter or without one kernel forward-mode derivatives need `adjoint=diffrax.ForwardMode()`.
+      it. Steps of a derivative are its own, with an error of up to ten tolerances relative to its largest entry: about an equilibrium
+      the solution itself allows any step. `max_steps` holds for them too; beyond, the derivative is NaN. They are those of the
+      solution, and may leap over what the derivative needs (give `dtmax` of the controller), with `adjoint=ForwardMode()`, with
+      `SaveAt(dense=True)` or `steps=True`, and in reverse with an event, without a tape (`max_steps=None`, many unknowns) and through
+      a `custom_vjp`. Second derivatives are there in any order of modes, third ones with `jax.jacfwd` outside; with a progress meter
+      or without one kernel forward-mode derivatives need `adjoint=diffrax.ForwardMode()`.
 
     **Returns** a `DAESolution`.
 

@@ -29,7 +29,7 @@ from ..solvers import (
 from ..types import Time, Y
 from .bracket import bracketing
 from .crossings import OneCrossing, OnStates
-from .felt_steps import felt_steps
+from .felt_steps import OneDirection, felt_steps
 from .followed_steps import RecordedEnds, at_steps, taken
 from .observed_steps import Observer, observed
 from .passages import passages
@@ -77,8 +77,10 @@ def call(solve: "Solve", problem: Problem, steps: Float[Array, " steps"] | None 
     decode = Decode(solve.formulation, solve.solver)
     solver, controller = economical(solve.solver, solve.between()), _fitted(solve.controller, t0, t1)
     _refuse_other_tolerances(controller, y)
+    felt = isinstance(solve.adjoint, OneDirection)
     if takes_residuals(solver):
         solver, controller = _of_residuals(solver, controller)
+        ode = dataclasses.replace(ode, felt=felt)
         dt0 = first_step(ode.start, solver, t0, t1, y) if dt0 is None else dt0
     else:
         solver = _with_tolerances_within(solver, controller)
@@ -113,7 +115,7 @@ def call(solve: "Solve", problem: Problem, steps: Float[Array, " steps"] | None 
     switches = stepped_over(problem) if steps is None and not solve.recording else None
     if switches is not None:
         observers["switches"] = switches
-    if solve.felt and isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
+    if felt and isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
         controller = felt_steps(controller)
     controller = observed(controller if steps is None else at_steps(controller, steps), observers)
     saveat = dataclasses.replace(saveat, controller_state=True) if observers else saveat

@@ -5,43 +5,36 @@ parameter grows into is lost in such steps. A derivative is found by steps whose
 derivative's own, relative to its size.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import diffrax
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jax.flatten_util import ravel_pytree
 
+from ..compiler import equations
+from ..solvers import felt
 from ..types import State, Time, Y
 from .observed_steps import AbstractStepsOf
 
 
-@jax.custom_jvp
-def felt(error: Y, y0: Y, y1: Y) -> Y:
-    """The error of a step from y₀ to y₁. Under forward derivatives it is, where that is more, δerror · (1 + |y|) / |δy|."""
-    return error
+class OneDirection(diffrax.ForwardMode):
+    """Forward derivatives along one direction, by steps that are short enough for it: those of the solution are the same."""
 
 
-@felt.defjvp
-def _(primals: tuple[Y, Y, Y], tangents: tuple[Y, Y, Y]) -> Any:
-    error, y0, y1 = primals
-    largest = lambda *trees: jnp.max(jnp.stack([jnp.max(jnp.abs(x), initial=0.0) for x in jax.tree.leaves(trees)]))
-    size = largest(tangents[1], tangents[2])
-    relative = 1 / jnp.where(size > 0, size, 1)
-
-    def larger(error: Any, change: Any, before: Any, after: Any) -> Any:
-        of_change = jnp.abs(change) * relative * (1 + jnp.maximum(jnp.abs(before), jnp.abs(after)))
-        return lax.stop_gradient(jnp.where(of_change > jnp.abs(error), of_change, error))
-
-    found = jax.tree.map(larger, error, tangents[0], y0, y1)
-    return found, jax.tree.map(jnp.zeros_like, found)
-
-
-def some_change(y: State) -> Any:
-    """A direction in which all of a state moves, by no pattern."""
-    numbers, tree = ravel_pytree(y)
-    return tree((1 + jnp.abs(numbers)) * jnp.cos(1 + jnp.arange(numbers.size, dtype=numbers.dtype) ** 2))
+def by_felt_steps(solved: Callable[[State], Any], y0: State, consistent: Callable[[State], State] | None) -> Any:
+    """What a solve with `felt_steps` gives for a start, by steps that are short enough for what some change of it grows into, one that
+    stays `consistent` where this is given. Where a function of the user has a derivative in reverse only, a rule of its own, they are
+    those of the solution.
+    """
+    if any(eqn.primitive.name.startswith("custom_vjp") for eqn in equations(jax.make_jaxpr(solved)(y0))):
+        return solved(y0)
+    numbers, tree = ravel_pytree(y0)
+    # All of the start moves, by no pattern.
+    change = (1 + jnp.abs(numbers)) * jnp.cos(1 + jnp.arange(numbers.size, dtype=numbers.dtype) ** 2)
+    change = tree(change) if consistent is None else jax.jvp(consistent, (y0,), (tree(change),))[1]
+    return jax.jvp(solved, (y0,), (change,))[0]
 
 
 def felt_steps(controller: diffrax.AbstractAdaptiveStepSizeController) -> Any:

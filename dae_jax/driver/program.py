@@ -14,8 +14,10 @@ from jaxtyping import Array, PyTree
 from .._compat import is_captured, lacks_reverse_derivatives, trace_state_clean
 from ..compiler import PullBack, inexact, one_kernel, one_kernel_enabled, waiting
 from ..compiler.types import Arrays
+from ..consistent import consistent_state
 from ..equations.independent import independent
 from ..equations.regularity import COARSE
+from ..equations.residual_form import LARGE
 from ..formulations import AbstractFormulation
 from ..solution import DAESolution
 from ..solvers import AbstractManifoldSolver, economical, replays, takes_residuals
@@ -25,7 +27,7 @@ from ..validate.user_functions import refuse_wrong_functions, returned
 from .diffrax_call import Decode, View, call
 from .ends import look
 from .event_functions import refuse_wrong_event
-from .felt_steps import some_change
+from .felt_steps import OneDirection, by_felt_steps
 from .outcome import judged
 from .problem import Problem, Program, Split, split
 from .resets import Reset, solve_with_resets
@@ -108,7 +110,7 @@ def run(program: Program, arrays: Arrays) -> tuple[DAESolution, Any, float]:
 @functools.partial(
     jax.tree_util.register_dataclass,
     data_fields=("formulation", "solver", "saveat", "controller", "adjoint", "event", "progress_meter"),
-    meta_fields=("max_steps", "recording", "felt"),
+    meta_fields=("max_steps", "recording"),
 )
 @dataclasses.dataclass(frozen=True, eq=False)
 class Solve:
@@ -124,8 +126,6 @@ class Solve:
     max_steps: int | None
     # Whether the dense output is there for the tape alone.
     recording: bool = False
-    # Whether the steps are those of a derivative, a program of its own.
-    felt: bool = False
 
     def __call__(self, problem: Problem) -> tuple[DAESolution, Any]:
         backwards = problem.t1 < problem.t0
@@ -206,6 +206,7 @@ class Solve:
     def _pull_back(self, problem: Problem) -> PullBack | None:
         """The reverse derivative from a tape, where it applies."""
         size = sum(leaf.size for leaf in jax.tree.leaves(problem.y0))
+        fixed_steps = isinstance(self.controller, diffrax.ConstantStepSize)
         if self.derivative() != "reverse" or not can_be_taped(self, size):
             return None
         program, _ = split((self, problem))
@@ -222,8 +223,13 @@ class Solve:
                     numbers, also_arrays = recording.kernel(dataclasses.replace(problem, y0=y0))
                     return numbers(also_arrays).numbers
 
-                # Along some change of the start, so that the steps are short enough for it too.
-                (_, _, ts, ys, interpolation, *_), _ = jax.jvp(record, (problem.y0,), (some_change(problem.y0),))
+                if fixed_steps or size > LARGE:
+                    tape = record(problem.y0)
+                else:
+                    # Solvers of residuals do not take a start that is not consistent.
+                    consistent = lambda y: consistent_state(problem.system, problem.t0, y, problem.args)
+                    tape = by_felt_steps(record, problem.y0, consistent if takes_residuals(self.solver) else None)
+                _, _, ts, ys, interpolation, *_ = tape
                 numbers, others = eqx.partition(arrays, eqx.is_inexact_array)
                 fixed: list[Any] = []
 
@@ -235,7 +241,6 @@ class Solve:
                 found, through_encoding = jax.vjp(encoded, numbers)
                 of_t0, of_t1, of_ts, of_ys, _, of_stats, *_ = cotangent.numbers
                 of_t1 = of_t1 + of_stats["end_time"]
-                fixed_steps = isinstance(self.controller, diffrax.ConstantStepSize)
                 tape = ts["tape"], ys["tape"], None if interpolation is None else interpolation.path.infos
                 of_taped = cotangents(eqx.combine(found, Taped(*fixed)), fixed_steps, tape, of_ys)
                 return inexact(through_encoding(saved_times(of_taped, self.saveat.subs, of_t0, of_t1, of_ts))[0])
@@ -252,7 +257,7 @@ class Solve:
     def forwards(self) -> "Solve":
         """The same solve with forward derivatives, and with steps that are short enough for them."""
         apart = self.derivative() == "reverse" and one_kernel_enabled()
-        return dataclasses.replace(self, adjoint=diffrax.ForwardMode(), felt=apart)
+        return dataclasses.replace(self, adjoint=OneDirection() if apart else diffrax.ForwardMode())
 
     def derivative(self) -> Any:
         """In which mode the adjoint allows derivatives; a progress meter needs callbacks."""

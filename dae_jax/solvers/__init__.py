@@ -11,6 +11,7 @@ from .abilities import (
 from .bdf import BDF as BDF
 from .dop853 import DOP853 as DOP853
 from .failed_steps import WithoutFailedSteps as WithoutFailedSteps
+from .felt import felt as felt
 from .gauss import Gauss4 as Gauss4
 from .implicit import AbstractImplicitSolver as AbstractImplicitSolver
 from .manifold import AbstractManifoldSolver as AbstractManifoldSolver

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..linalg import implicit_root, rms_norm
 from ..types import BoolLike, Time
+from .felt import felt
 from .manifold import time_sign
 from .replay import Replayable
 from .residual_steps import (
@@ -217,7 +218,8 @@ class BDF(Replayable, AbstractResidualSolver):
         change, phi = _differences(y1 - step.y, star, k)
 
         scale = args.weights(h) * args.counted(self.dense) / tol.scale(y0, y1)
-        size = lambda row: rms_norm(constant(row * scale))
+        seen = (lambda row: felt(row, y0, y1)) if args.felt else lambda row: row
+        size = lambda row: rms_norm(constant(seen(row) * scale))
         sizes = [size(row) for row in phi]
         higher = size(change - _at(star, k + 1))
         alike = jnp.where(method.constant & (k == state.used), state.alike, 0) + 1

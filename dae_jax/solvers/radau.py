@@ -11,9 +11,10 @@ from jaxtyping import Array, Bool, Float
 
 from ..linalg import implicit_root
 from ..types import BoolLike, Time
+from .felt import felt
 from .manifold import time_sign
 from .radau_coefficients import coefficients
-from .radau_error import error_of_step
+from .radau_error import embedded, error_of_step
 from .radau_step import CollocationPolynomial, Step, along, coupled, linear_solve
 from .replay import Replayable
 from .residual_steps import (
@@ -145,6 +146,9 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
         z, (newton, jacobians, factors, work) = _stages(lambda params: _solve(*params), (step, constant(state), tol))
         y1 = y0 + z[-1]
         counted = error_of_step(*constant((step, factors.real, z, state)), tol=tol, dense=self.dense)
+        if args.felt:
+            seen = constant(felt(embedded(step, constant(factors.real), z, tol)[1], y0, y1))
+            counted = jnp.where(jnp.abs(seen) > jnp.abs(counted), seen, counted)
         rates, smallest = step.stages(z)[-1][2], step.smallest
         # What is algebraic may jump in the smallest step.
         bend = constant((rates - state.rates) * (step.h / 2)) * args.structure.differential

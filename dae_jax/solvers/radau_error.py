@@ -21,7 +21,7 @@ def error_of_step(
     filtered once: with x' = z, R z = u(t) − x and R ≪ h the filter takes all of the error of z.
     """
     linearised, ends = step.linearised, (step.y0, step.y0 + z[-1])
-    once, filtered = _embedded(step, factor, z, tol)
+    once, filtered = embedded(step, factor, z, tol)
     shown, always = linearised.form.shown, linearised.between(dense)
     if not shown.any():
         return filtered
@@ -34,7 +34,7 @@ def error_of_step(
     return jnp.where(jnp.abs(counted) > jnp.abs(filtered), counted, filtered)
 
 
-def _embedded(step: Step, factor: Any, z: Any, tol: Tolerances) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+def embedded(step: Step, factor: Any, z: Any, tol: Tolerances) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     """−(γ/h M + J)⁻¹ F(t₀, y₀, −Σ eᵢ zᵢ/h), and where that is large once more from y₀ + error (eqs. IV.8.19, IV.8.20)."""
     rate = sum(float(e) * z[i] for i, e in enumerate(step.method.error)) * (-step.sign / step.h)
     weights = step.linearised.weights(step.h)

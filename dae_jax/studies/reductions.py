@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import diffrax
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
@@ -10,6 +9,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from ..compiler import at_ease
 from ..consistent import consistent_state
 from ..diagnostics import drift, energy
+from ..driver.felt_steps import OneDirection
 from ..solution import RESULTS, DAESolution
 from ..solve import daesolve
 from ..systems import ConstrainedSystem, System
@@ -74,9 +74,8 @@ def lyapunov(
 
     δy is the derivative of the solution (tangent dynamics, by `jax.jvp`) in one direction, which is made consistent with
     the constraints and the hidden ones: `direction`, with the structure of `y0`, by default 1 everywhere. `options` are
-    those of `daesolve`, but for `event`, `saveat` and `adjoint`. About an equilibrium or a steady motion give steps of a part of the time
-    scale: they are chosen for the solution, which has none there. NaN where a solve with `throw=False` failed. Derivatives of the
-    exponent are found in forward mode (`jax.jacfwd`).
+    those of `daesolve`, but for `event`, `saveat` and `adjoint`. Steps are chosen for δy as for the solution. NaN where a solve with
+    `throw=False` failed. Derivatives of the exponent are found in forward mode (`jax.jacfwd`).
 
     Errors: `TypeError` for one of these three.
     """
@@ -88,7 +87,7 @@ def lyapunov(
 
     def end(y: State) -> tuple[Any, DAESolution]:
         sol = daesolve(
-            system, solver, t0, t1, options.get("dt0"), y, args, adjoint=diffrax.ForwardMode(),
+            system, solver, t0, t1, options.get("dt0"), y, args, adjoint=OneDirection(),
             **{name: value for name, value in options.items() if name != "dt0"},
         )  # fmt: skip
         return sol.final, sol

@@ -1,0 +1,83 @@
+"""Derivatives about an equilibrium and a steady motion, where the solution itself allows any step."""
+
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dae_jax as D
+from dae_jax.studies import reductions
+
+
+GRAVITY = 9.81
+PENDULUM = D.ConstrainedSystem(lambda t, q, v, a: jnp.array([0.0, -a]), lambda t, q, a: (q @ q - 1) / 2)
+SOLVERS = {
+    "Dopri8": diffrax.Dopri8(),
+    "projection": D.OrthogonalProjection(D.DOP853()),
+    "tangent": D.TangentSpace(diffrax.Tsit5()),
+    "RadauIIA5": D.RadauIIA5(),
+    "RadauIIA9": D.RadauIIA9(),
+    "BDF": D.BDF(),
+    "selected states": D.DOP853(),
+    "selected residuals": D.RadauIIA5(),
+}
+# Of the end, 5 s after the start, by the speed of the start.
+FREQUENCY = GRAVITY**0.5
+EXACT = np.sin(5 * FREQUENCY) / FREQUENCY
+
+
+def moved(v: Any, solver: str, gravity: float = GRAVITY, **options: Any) -> Any:
+    """How far from the lowest point a pendulum that starts there is after 5 s."""
+    form = D.DummyDerivatives() if solver.startswith("selected") else None
+    start = jnp.array([0.0, -1.0]), jnp.stack([v, 0 * v])
+    sol = D.daesolve(PENDULUM, SOLVERS[solver], 0.0, 5.0, None, start, gravity, formulation=form, **options)
+    return sol.ys[0][-1, 0]
+
+
+@pytest.mark.parametrize("by", [jax.jacfwd, jax.grad], ids=["forwards", "reverse"])
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_about_an_equilibrium(solver: str, by: Any) -> None:
+    assert abs(by(lambda v: moved(v, solver))(0.0) - EXACT) < 3e-5 * abs(EXACT)
+
+
+def test_looser_tolerances_give_as_much() -> None:
+    steps = diffrax.PIDController(1e-5, 1e-5)
+    found = jax.grad(lambda v: moved(v, "projection", stepsize_controller=steps))(0.0)
+    assert abs(found - EXACT) < 1e-2 * abs(EXACT)
+
+
+@pytest.mark.parametrize("by", [jax.jacfwd, jax.grad], ids=["forwards", "reverse"])
+def test_about_a_steady_motion(by: Any) -> None:
+    """Two bodies around each other, ẍ = −x / |x|³: δẍ along the orbit, against one by steps of a hundredth of a turn."""
+    system = D.ImplicitDAE(lambda t, y, yd, a: [*(yd[:2] - y[2:]), *(yd[2:] + y[:2] / (y[:2] @ y[:2]) ** 1.5)])
+    start = jnp.array([1.0, 0.0, 0.0, 1.0])
+
+    def end(v: Any, **options: Any) -> Any:
+        return D.daesolve(system, D.DOP853(), 0.0, 6.0, None, start.at[3].add(v), **options).ys[-1, 0]
+
+    steps = diffrax.PIDController(1e-12, 1e-12, dtmax=0.06)
+    assert abs(by(end)(0.0) - by(lambda v: end(v, stepsize_controller=steps, max_steps=10_000))(0.0)) < 1e-5
+
+
+def test_a_batch_of_them_is_one_at_a_time() -> None:
+    speeds = jnp.array([0.0, 0.5, 2.0])
+    found = jax.vmap(jax.grad(lambda v: moved(v, "projection")))(speeds)
+    one = np.array([jax.grad(lambda v: moved(v, "projection"))(v) for v in speeds])
+    assert np.abs(found - one).max() < 1e-12
+
+
+def test_a_state_that_does_not_depend_on_it() -> None:
+    """No derivative is no reason for smaller steps, nor a division by 0."""
+    assert jax.jacfwd(lambda g: moved(jnp.zeros(()), "projection", g))(GRAVITY) == 0
+
+
+def test_a_lyapunov_exponent_at_the_highest_point() -> None:
+    """sinh and cosh: (log cosh ωt) / t along δy = (δx, ω δx), which grows as e^ωt."""
+    solver = D.OrthogonalProjection(diffrax.Tsit5())
+    start = jnp.array([0.0, 1.0]), jnp.zeros(2)
+    along = jnp.array([1.0, 0.0]), jnp.array([FREQUENCY, 0.0])
+    found = reductions.lyapunov(PENDULUM, solver, 0.0, 3.0, start, GRAVITY, direction=along)
+    assert abs(found - FREQUENCY) < 1e-5
