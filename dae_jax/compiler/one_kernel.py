@@ -28,7 +28,7 @@ def one_kernel(
     derivative: Literal["forward", "reverse", "any"] = "any",
     pull_back: PullBack | None = None,
     forward: Callable[..., Any] | None = None,
-    seen: Callable[[Any], Array] | None = None,
+    way: Callable[..., Array] | None = None,
 ) -> Callable[..., Any]:
     """`fn` (pytrees of arrays to a pytree of arrays), compiled to one kernel on the CPU or a GPU where it qualifies.
 
@@ -39,19 +39,19 @@ def one_kernel(
     - `pull_back(args, cotangent)`, with "reverse", gives the cotangents of those leaves of `args` that are inexact, where
       a way is known that has forward derivatives.
     - `forward`, with "reverse": the same function, with forward derivatives of any order, where `fn` has none.
-    - `seen(result)`, with "reverse": integers that say which way the computation went. Its derivatives, which round in another way,
-      get them as one more argument of `fn` and `forward`.
+    - `way(args, result)`, with "reverse": integers that say which way the computation of derivatives goes. These get them as one more
+      argument of `fn`, `forward` and `pull_back`, so that they go the same way, whatever their directions are.
     """
     if not one_kernel_enabled() or derivative == "any":
         return fn
-    return _forward(fn) if derivative == "forward" else _reverse(fn, pull_back, forward or fn, seen)
+    return _forward(fn) if derivative == "forward" else _reverse(fn, pull_back, forward or fn, way)
 
 
 def _reverse(
     fn: Callable[..., Any],
     pull_back: PullBack | None,
     forward: Callable[..., Any],
-    seen: Callable[[Any], Array] | None,
+    way: Callable[..., Array] | None,
 ) -> Callable[..., Any]:
     def flat(*args: PyTree) -> Any:
         leaves, treedef = jax.tree.flatten(args)
@@ -66,7 +66,7 @@ def _reverse(
         def _(xs: Sequence[Array], dxs: Sequence[Array]) -> Any:
             out = solve(*xs)
             ys, of_ys = jax.tree.flatten(out)
-            at, of_at = jax.tree.flatten(args_of(xs) if seen is None else (*args_of(xs), seen(out)))
+            at, of_at = jax.tree.flatten(args_of(xs) if way is None else (*args_of(xs), way(args_of(xs), out)))
             push = _derivative(
                 fn, pull_back, forward, of_at, list(map(is_inexact, at)), of_ys, list(map(is_inexact, ys))
             )

@@ -106,7 +106,7 @@ def call(solve: "Solve", problem: Problem, steps: Float[Array, " steps"] | None 
     saveat = dataclasses.replace(saveat, solver_state=True) if counts(solver) else saveat
     sums_errors = isinstance(controller, diffrax.ConstantStepSize) and not solve.recording
     observers: dict[str, Observer] = {"errors": SummedErrors()} if sums_errors else {}
-    if steps is None and solve.records_steps():
+    if steps is None and (felt or solve.records_steps()):
         assert solve.max_steps is not None
         observers["ends"] = RecordedEnds(solve.max_steps)
     passage = passages(problem, ode, solve.formulation.decode, not solve.keeps()[0], solve.formulation.inverts_mass)
@@ -142,7 +142,7 @@ def call(solve: "Solve", problem: Problem, steps: Float[Array, " steps"] | None 
         passed, determined, _ = found["passage"]
         result = RESULTS.where((result == RESULTS.successful) & ~jnp.asarray(determined), RESULTS.undetermined, result)
     seen = found["errors"].total if "errors" in found else None, passed, found.get("switches", False)
-    times = taken(found["ends"]) if "ends" in found else steps
+    times = taken(found["ends"]) if "ends" in found else steps if solve.records_steps() else None
     return sol.t0, sol.t1, ts["user"], ys["user"], interpolation, stats, result, sol.event_mask, seen, end, times
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Array, PyTree
 
 from .._compat import is_captured, lacks_reverse_derivatives, trace_state_clean
 from ..compiler import PullBack, inexact, one_kernel, one_kernel_enabled, waiting
+from ..compiler.kernel_call import as_kernel
 from ..compiler.types import Arrays
 from ..consistent import consistent_state
 from ..equations.independent import independent
@@ -32,7 +33,7 @@ from .outcome import judged
 from .problem import Problem, Program, Split, split
 from .resets import Reset, solve_with_resets
 from .start import saved_parts
-from .trajectory_adjoint import Taped, can_be_taped, cotangents, recorded, saved_times
+from .trajectory_adjoint import Taped, as_it_is, can_be_taped, cotangents, recorded, saved_times
 
 
 # How many problems stay compiled. Each holds 8 MB and more, most of it in JAX's caches of what it has traced.
@@ -73,7 +74,10 @@ def _numbers(program: Program, arrays: Arrays, steps: Array | None = None) -> Sp
 
 def _of_steps(result: Split) -> Array:
     """The times of the steps, as numbers without a derivative."""
-    times = result.numbers[-1]
+    return _as_bits(result.numbers[-1])
+
+
+def _as_bits(times: Array) -> Array:
     return jax.lax.bitcast_convert_type(times, jnp.int64 if times.dtype == jnp.float64 else jnp.int32)
 
 
@@ -133,8 +137,8 @@ class Solve:
         numbers, arrays = self.kernel(problem)
         forward, _ = self.forwards().kernel(problem)
         pull_back = self._pull_back(problem)
-        seen = _of_steps if self.records_steps() else None
-        *fields, end, _ = one_kernel(numbers, self.derivative(), pull_back, forward, seen)(arrays).whole()
+        way = (lambda args, result: _of_steps(result)) if self.records_steps() else self._felt_steps(problem)
+        *fields, end, _ = one_kernel(numbers, self.derivative(), pull_back, forward, way)(arrays).whole()
         check, check_arrays = self._check(problem, end)
         # A yes or no has no derivative.
         found = one_kernel(check, self.derivative())(jax.lax.stop_gradient(check_arrays))
@@ -213,23 +217,13 @@ class Solve:
 
         def pull_back(inputs: tuple[Arrays], cotangent: Split) -> list[Any]:
             with settled(program.leaves):
-                (arrays,) = inputs
+                arrays, *steps = inputs
                 solve, problem = program.whole(arrays)
                 recording = dataclasses.replace(
                     solve.forwards(), saveat=recorded(solve.saveat, replays(solve.solver)), recording=True
                 )
-
-                def record(y0: State) -> Any:
-                    numbers, also_arrays = recording.kernel(dataclasses.replace(problem, y0=y0))
-                    return numbers(also_arrays).numbers
-
-                if fixed_steps or size > LARGE:
-                    tape = record(problem.y0)
-                else:
-                    # Solvers of residuals do not take a start that is not consistent.
-                    consistent = lambda y: consistent_state(problem.system, problem.t0, y, problem.args)
-                    tape = by_felt_steps(record, problem.y0, consistent if takes_residuals(self.solver) else None)
-                _, _, ts, ys, interpolation, *_ = tape
+                record, also_arrays = recording.kernel(problem)
+                _, _, ts, ys, interpolation, *_ = record(also_arrays, *steps).numbers
                 numbers, others = eqx.partition(arrays, eqx.is_inexact_array)
                 fixed: list[Any] = []
 
@@ -247,6 +241,28 @@ class Solve:
 
         return pull_back
 
+    def _felt_steps(self, problem: Problem) -> Callable[..., Array] | None:
+        """The steps of derivatives, which are the same for all of them: in the sum of a second derivative's parts, what leads off
+        the manifold cancels only if these have the same steps.
+        """
+        adaptive = isinstance(self.controller, diffrax.AbstractAdaptiveStepSizeController)
+        size = sum(leaf.size for leaf in jax.tree.leaves(problem.y0))
+        apart = self.derivative() == "reverse" and one_kernel_enabled() and not self.recording
+        if not (adaptive and apart) or self.event is not None or self.max_steps is None or size > LARGE:
+            return None
+        saveat = diffrax.SaveAt(subs=diffrax.SubSaveAt(t1=True, fn=as_it_is))
+        program, _ = split((self, problem))
+
+        def steps(arrays: Arrays) -> Array:
+            with settled(program.leaves):
+                solve, problem = program.whole(arrays)
+                solve = dataclasses.replace(solve, adjoint=OneDirection(), saveat=saveat)
+                solved = lambda y0: call(solve, dataclasses.replace(problem, y0=y0))[-1]
+                consistent = lambda y: consistent_state(problem.system, problem.t0, y, problem.args)
+                return _as_bits(by_felt_steps(solved, problem.y0, consistent if takes_residuals(solve.solver) else None))
+
+        return lambda args, _: as_kernel(steps)(*jax.lax.stop_gradient(args))
+
     def _taped(self, problem: Problem) -> Taped:
         y, ode = self.encoded(problem)
         part = self.saveat.subs
@@ -255,9 +271,8 @@ class Solve:
         return Taped(self.formulation, solver, part, problem.t0, problem.t1, problem.dt0, y, ode, view)
 
     def forwards(self) -> "Solve":
-        """The same solve with forward derivatives, and with steps that are short enough for them."""
-        apart = self.derivative() == "reverse" and one_kernel_enabled()
-        return dataclasses.replace(self, adjoint=OneDirection() if apart else diffrax.ForwardMode())
+        """The same solve with forward derivatives."""
+        return dataclasses.replace(self, adjoint=diffrax.ForwardMode())
 
     def derivative(self) -> Any:
         """In which mode the adjoint allows derivatives; a progress meter needs callbacks."""
