@@ -23,17 +23,19 @@ class OneDirection(diffrax.ForwardMode):
     """Forward derivatives along one direction, by steps that are short enough for it: those of the solution are the same."""
 
 
-def by_felt_steps(solved: Callable[[State], Any], y0: State, consistent: Callable[[State], State] | None) -> Any:
-    """What a solve with `felt_steps` gives for a start, by steps that are short enough for what some change of it grows into, one that
-    stays `consistent` where this is given. Where a function of the user has a derivative in reverse only, a rule of its own, they are
-    those of the solution.
+def some_change(y0: State, consistent: Callable[[State], State] | None) -> State:
+    """A change of all of a start, by no pattern, which stays `consistent` where this is given."""
+    numbers, tree = ravel_pytree(y0)
+    change = tree((1 + jnp.abs(numbers)) * jnp.cos(1 + jnp.arange(numbers.size, dtype=numbers.dtype) ** 2))
+    return change if consistent is None else jax.jvp(consistent, (y0,), (change,))[1]
+
+
+def by_felt_steps(solved: Callable[[State], Any], y0: State, change: State) -> Any:
+    """What a solve with `felt_steps` gives for a start, by steps that are short enough for what a change of it grows into. Where a
+    function of the user has a derivative in reverse only, a rule of its own, they are those of the solution.
     """
     if any(eqn.primitive.name.startswith("custom_vjp") for eqn in equations(jax.make_jaxpr(solved)(y0))):
         return solved(y0)
-    numbers, tree = ravel_pytree(y0)
-    # All of the start moves, by no pattern.
-    change = (1 + jnp.abs(numbers)) * jnp.cos(1 + jnp.arange(numbers.size, dtype=numbers.dtype) ** 2)
-    change = tree(change) if consistent is None else jax.jvp(consistent, (y0,), (tree(change),))[1]
     return jax.jvp(solved, (y0,), (change,))[0]
 
 

@@ -28,7 +28,7 @@ from ..validate.user_functions import refuse_wrong_functions, returned
 from .diffrax_call import Decode, View, call
 from .ends import look
 from .event_functions import refuse_wrong_event
-from .felt_steps import OneDirection, by_felt_steps
+from .felt_steps import OneDirection, by_felt_steps, some_change
 from .outcome import judged
 from .problem import Problem, Program, Split, split
 from .resets import Reset, solve_with_resets
@@ -253,15 +253,21 @@ class Solve:
         saveat = diffrax.SaveAt(subs=diffrax.SubSaveAt(t1=True, fn=as_it_is))
         program, _ = split((self, problem))
 
-        def steps(arrays: Arrays) -> Array:
+        def steps(arrays: Arrays, change: State) -> Array:
             with settled(program.leaves):
                 solve, problem = program.whole(arrays)
                 solve = dataclasses.replace(solve, adjoint=OneDirection(), saveat=saveat)
                 solved = lambda y0: call(solve, dataclasses.replace(problem, y0=y0))[-1]
-                consistent = lambda y: consistent_state(problem.system, problem.t0, y, problem.args)
-                return _as_bits(by_felt_steps(solved, problem.y0, consistent if takes_residuals(solve.solver) else None))
+                return _as_bits(by_felt_steps(solved, problem.y0, change))
 
-        return lambda args, _: as_kernel(steps)(*jax.lax.stop_gradient(args))
+        def way(args: tuple[Arrays], _: Split) -> Array:
+            (arrays,) = jax.lax.stop_gradient(args)
+            _, problem = program.whole(arrays)
+            consistent = lambda y: consistent_state(problem.system, problem.t0, y, problem.args)
+            change = some_change(problem.y0, consistent if takes_residuals(self.solver) else None)
+            return as_kernel(steps)(arrays, change)
+
+        return way
 
     def _taped(self, problem: Problem) -> Taped:
         y, ode = self.encoded(problem)
