@@ -12,6 +12,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from ..equations.index1_form import Index1Form
+from ..equations.leading import LeadingMatrix
+from ..equations.linearised import LinearisedResidual
 from ..equations.manifold_ode import Equations
 from ..equations.mechanical import MechanicalODE
 from ..equations.regularity import mass_is_regular, passes_singularity
@@ -61,19 +64,36 @@ class Passage(eqx.Module):
 
 
 class Undetermined(eqx.Module):
-    """Whether a step of an explicit method ends where the equations do not determine all highest derivatives, or passes such a point:
-    a determinant has another sign, and another value half-way. (Where the matrix jumps, with a switch, it has the value of one end.)
+    """Whether a step of an explicit method ends where the equations do not determine all highest derivatives, or any step passes such
+    a point: a determinant has another sign, and another value half-way. (Where the matrix jumps, with a switch, it has the value of
+    one end.) `leading`: of the equations that a method for residuals solves as they are written.
     """
+
+    leading: LeadingMatrix | None = eqx.field(static=True, default=None)
 
     def begin(self, t0: Time, y0: Y, args: Equations) -> Seen:
         """Before the first step, whose start is yet to be looked at."""
-        assert isinstance(args, StructuralODE)
-        unknown = jnp.full((2, len(args.oriented)), jnp.nan, jnp.result_type(t0))
-        return Seen(jnp.asarray(False), jnp.asarray(True), unknown)
+        dtype = jnp.result_type(t0)
+        if self.leading is not None:
+            assert isinstance(args, LinearisedResidual)
+            blocks, slope = self.leading.blocks, _Slope(args.start, jnp.zeros((), dtype))
+        else:
+            blocks, slope = _underlying(args).oriented, None
+        return Seen(jnp.asarray(False), jnp.asarray(True), (jnp.full((2, len(blocks)), jnp.nan, dtype), slope))
+
+    def _look(self, equations: Any, t: Time, y: Y, rates: Any) -> tuple[BoolLike, Any]:
+        """Whether all is determined at a point, and what of the determinants is compared."""
+        if self.leading is not None:
+            return True, self.leading.determinants(equations.form, t, y, rates)
+        ode = _underlying(equations)
+        determined, found = ode.determines_highest(t, y[: ode.orders.size])
+        # A method for residuals looks at the matrix of its own unknowns.
+        return determined if ode is equations else True, found
 
     def __call__(self, step: Step, before: Seen) -> Seen:
-        equations, t0, t1 = step.args, step.direction * step.t0, step.direction * step.t1
-        assert isinstance(equations, StructuralODE)
+        t0, t1 = step.direction * step.t0, step.direction * step.t1
+        marked, slope = before.mark
+        rates = (0, 0) if slope is None else slope.at_ends(t1 - t0, step.y1 - step.y0)
 
         def goes_on(carry: Any) -> BoolScalar:
             k, _, (start, end, _) = carry
@@ -83,20 +103,44 @@ class Undetermined(eqx.Module):
         def look(carry: Any) -> Any:
             k, _, found = carry
             at = lambda a, b: jnp.where(k == 0, a, jnp.where(k == 1, b, (a + b) / 2))
-            determined, here = equations.determines_highest(at(t0, t1), jax.tree.map(at, step.y0, step.y1))
+            point = at(t0, t1), jax.tree.map(at, step.y0, step.y1), at(*rates)
+            determined, here = self._look(step.args, *point)
             return (
                 k + 1,
                 jnp.where(k == 1, determined, carry[1]),
                 jnp.where(jnp.arange(3)[:, None, None] == k, here, found),
             )
 
-        first = jnp.where(jnp.any(jnp.isnan(before.mark[0])), 0, 1)
-        marks = jnp.stack([before.mark] * 3)
-        _, determined, (start, end, half_way) = lax.while_loop(goes_on, look, (first, jnp.asarray(True), marks))
-        jumps = (jnp.abs(half_way[1] - start[1]) < ALIKE) | (jnp.abs(half_way[1] - end[1]) < ALIKE)
+        first = jnp.where(jnp.any(jnp.isnan(marked[0])), 0, 1)
+        _, determined, (start, end, half_way) = lax.while_loop(
+            goes_on, look, (first, jnp.asarray(True), jnp.stack([marked] * 3))
+        )
+        same = lambda a, b: (a[0] == b[0]) & (jnp.abs(a[1] - b[1]) < ALIKE)
+        jumps = same(half_way, start) | same(half_way, end)
         passed = before.passed | jnp.any((end[0] * start[0] < 0) & ~jumps)
-        after = Seen(passed, before.determined & determined, jnp.where(end[0] == 0, start, end))
-        return _if_kept(step, after, before)
+        slope = None if slope is None else slope.after(t1 - t0, step.y1 - step.y0)
+        mark = jnp.where(end[0] == 0, start, end), slope
+        return _if_kept(step, Seen(passed, before.determined & determined, mark), before)
+
+
+class _Slope(NamedTuple):
+    """That of the last step, and its size; before the first one ẏ, and 0."""
+
+    rates: Any
+    size: Any
+
+    def at_ends(self, h: Any, change: Any) -> Any:
+        """ẏ at the ends of the next step, of that size, by the parabola of both."""
+        bend = (change / h - self.rates) * (h / (h + self.size))
+        return change / h - bend, change / h + bend
+
+    def after(self, h: Any, change: Any) -> "_Slope":
+        return _Slope(change / h, h)
+
+
+def _underlying(equations: Any) -> StructuralODE:
+    """The underlying ODE that is integrated, or that equations of index 1 are made of."""
+    return equations if isinstance(equations, StructuralODE) else equations.form.ode
 
 
 def passages(
@@ -105,11 +149,13 @@ def passages(
     """What sees them in the solution of a problem, by the equations that are integrated: in that of a mechanism with few
     constraints, or where the matrix of highest derivatives is not constant.
     """
-    if isinstance(ode, StructuralODE):
-        return Undetermined() if ode.varying else None
     system, t, state, args = problem.start
+    if isinstance(ode, StructuralODE) or (isinstance(ode, LinearisedResidual) and isinstance(ode.form, Index1Form)):
+        return Undetermined() if _underlying(ode).varying else None
     if not is_mechanism(system):
-        return None
+        assert isinstance(ode, LinearisedResidual)
+        leading = LeadingMatrix.of(ode.form, jnp.result_type(t))
+        return Undetermined(leading) if leading.blocks else None
     ode = MechanicalODE.of(system, t, state, args, problem.rank)
     masses = callable(system.mass) and not inverts_mass
     return Passage(ode, decode, drifts, masses) if 0 < ode.holonomic + ode.nonholonomic <= ORIENTED else None

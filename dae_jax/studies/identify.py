@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from ..compiler import at_ease
 from ..solution import AccuracyWarning
-from ..types import DType, Scalar
+from ..types import BoolScalar, DType, Scalar
 from ..validate.states import NUMBERS, brief, describe
 from .identified import Identified, named
 from .least_squares import Factors, Minimum, factors, minimum
@@ -29,6 +29,13 @@ AT_THE_START = (
     " So it is at the start, `params`: of a solve that failed with `throw=False`, or of a time that it did not reach, there are "
     "no numbers."
 )
+
+
+class Failed(NamedTuple):
+    """Whether the descent did not come to an end, and whether that is at a maximum of |r|², or a saddle."""
+
+    unfinished: BoolScalar
+    peaked: BoolScalar
 
 
 @at_ease
@@ -72,7 +79,7 @@ def identify(
     and of residuals larger than `sigma` allows. Such parameters keep what they were at the start, along the combination.
 
     Errors: `ValueError` or `TypeError` for data, parameters or a model that are not finite, not real, or not of the shape they
-    should have; `RuntimeError` where the minimum was not found, or a solve with `throw=True` failed on the way. Under `jit` and
+    should have; `RuntimeError` where the minimum was not found but a maximum, or nothing in `steps`, or a solve with `throw=True` failed on the way. Under `jit` and
     `vmap` there is no warning, and NaN in place of an error: a batch of
     experiments is `jax.vmap(lambda d: identify(model, params, d))(data)`.
 
@@ -96,10 +103,11 @@ def identify(
             raise TypeError(f"`model` has no forward derivative: {ADVICE}") from error
         raise
     if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((found, failed))):
-        _refuse_failure(model, params, found, bool(failed), steps)
+        _refuse_failure(model, params, found, failed, steps)
         _warn(found)
         return found
-    return jax.tree.map(lambda x: jnp.where(failed, jnp.nan, x) if jnp.issubdtype(x.dtype, jnp.inexact) else x, found)
+    lost = failed.unfinished | failed.peaked
+    return jax.tree.map(lambda x: jnp.where(lost, jnp.nan, x) if jnp.issubdtype(x.dtype, jnp.inexact) else x, found)
 
 
 def _identified(
@@ -110,7 +118,7 @@ def _identified(
     in_log: Bool[np.ndarray, " p"],
     steps: int,
     tolerance: float,
-) -> tuple[Identified, Bool[Array, ""]]:
+) -> tuple[Identified, Failed]:
     """What was found, and whether it is no minimum."""
     p, unravel = ravel_pytree(params)
     measured, unravel_data = ravel_pytree(data)
@@ -141,10 +149,11 @@ def _identified(
         value_and_jacobian, start, known=sigmas is not None, magnitude=magnitude, tolerance=tolerance, steps=steps
     )
     finite = jnp.all(jnp.isfinite(end.jacobian)) & jnp.all(jnp.isfinite(end.residual))
+    failed = Failed(~(end.converged & finite), ~end.bent)
     unit = 1.0 if sigmas is not None else unit.astype(dtype)
     found = _statistics(end, at(end.x), in_log, sigmas is not None, unit)
     residuals = unravel_data((-end.residual / weights).astype(measured.dtype))
-    return found._replace(residuals=residuals), ~(end.converged & finite)
+    return found._replace(residuals=residuals), failed
 
 
 def _statistics(
@@ -291,14 +300,19 @@ def _refuse_too_few(params: PyTree, data: PyTree, estimated: bool) -> None:
 # What comes of it
 
 
-def _refuse_failure(model: Callable[[Any], Any], params: PyTree, found: Identified, failed: bool, steps: int) -> None:
-    if not failed:
+def _refuse_failure(model: Callable[[Any], Any], params: PyTree, found: Identified, failed: Failed, steps: int) -> None:
+    if not (failed.unfinished or failed.peaked):
         return
     first = jax.jit(model)(params)
     for path, leaf in jax.tree_util.tree_leaves_with_path(first):
         _refuse_not_finite("model", path, leaf, AT_THE_START)
     if not np.isfinite(found.cost) or not np.all(np.isfinite(found.information)):
         raise ValueError("The derivative of `model` is not finite at the start, `params`.")
+    if not failed.unfinished:
+        raise RuntimeError(
+            f"`identify` has come to a maximum of the squares of the residuals, or to a saddle: it is at {found!r}, where they fall to "
+            "a side. Start elsewhere by `params`."
+        )
     raise RuntimeError(
         f"`identify` has not come to the minimum in {int(found.iterations)} of {steps} steps: it is at {found!r}, and that of the linear "
         f"model is {found.offset:.2g} standard errors away. {_advice(params, found)}"

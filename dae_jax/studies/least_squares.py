@@ -27,6 +27,8 @@ from ..types import BoolScalar, IntScalar, Scalar
 
 # Of what is no more than so many times its round-off, nothing is known.
 ROUND_OFF = 16
+# By what part of what is measured the model is moved to see which way |r|² is bent.
+SHOWN = 1e-3
 # The most Gauss–Newton steps from where the descent ends.
 POLISHED = 6
 
@@ -36,7 +38,9 @@ Jacobian: TypeAlias = Float[Array, "m p"]
 
 
 class Minimum(NamedTuple):
-    """Where the descent ended: r and J there, its steps, and the distance to the minimum in standard errors."""
+    """Where the descent ended: r and J there, its steps, and the distance to the minimum in standard errors; whether |r|² is `bent` up
+    there in all directions that are seen.
+    """
 
     x: Point
     residual: Residual
@@ -44,6 +48,7 @@ class Minimum(NamedTuple):
     steps: IntScalar
     offset: Scalar
     converged: BoolScalar
+    bent: BoolScalar
 
 
 class Factors(NamedTuple):
@@ -179,4 +184,24 @@ def minimum(
     # What seemed round-off may be noise: whole steps tell, which lead to the minimum where the digits suffice.
     first = (found.value, at, offset, converged, jnp.zeros_like(steps))
     x, at, offset, _, more = jax.lax.while_loop(unfinished, polish, first)
-    return Minimum(x, at.residual, at.jacobian, steps + more, offset, converged)
+    bent = _is_bent_up(value_and_jacobian, x, at, magnitude)
+    return Minimum(x, at.residual, at.jacobian, steps + more, offset, converged, bent)
+
+
+def _is_bent_up(
+    value_and_jacobian: Callable[[Point], tuple[Residual, Jacobian]], x: Point, at: _Linearised, magnitude: Scalar
+) -> BoolScalar:
+    """Whether Jᵀr grows along each direction v that is seen, from where it is 0: at a maximum of |r|², or a saddle, it does not. It is
+    compared with that at x + v, which the model shows as a thousandth of what is measured.
+    """
+    _, s, vt, scale = found = factors(at.jacobian)
+    show = SHOWN * jnp.maximum(magnitude, at.largest)
+
+    def grows(k: IntScalar, bent: BoolScalar) -> BoolScalar:
+        seen = found.seen[k] > 0
+        v = vt[k] / scale * jnp.where(seen, show / jnp.where(seen, s[k], 1), 0)
+        r, jacobian = value_and_jacobian(x + v)
+        growth = (jacobian @ v) @ r - (at.jacobian @ v) @ at.residual
+        return bent & ~(seen & (growth < 0))
+
+    return jax.lax.fori_loop(0, found.s.size, grows, jnp.asarray(True))

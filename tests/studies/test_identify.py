@@ -427,3 +427,25 @@ def test_a_model_without_forward_derivatives_is_refused():
     reverse.defvjp(lambda x: (x, None), lambda _, y: (y,))
     with pytest.raises(TypeError, match=r"has no forward derivative: .* `adjoint=diffrax.ForwardMode\(\)`"):
         dae_jax.identify(lambda p: reverse(p) * jnp.ones(4), 1.0, np.ones(4), 1.0)
+
+
+def test_a_maximum_is_no_end():
+    """A direction and a length against a point: opposite to it the squares have a saddle, at which all derivatives are 0, too."""
+    model = lambda p: p["length"] * jnp.stack([jnp.cos(p["angle"]), jnp.sin(p["angle"])])
+    data = jnp.array([0.6, 0.8])
+    opposite = np.arctan2(0.8, 0.6) + np.pi
+    at = lambda angle: {"length": jnp.asarray(1.0), "angle": jnp.asarray(angle)}
+    for off in (0.0, 1e-7, -1e-5):
+        with pytest.raises(RuntimeError, match="maximum of the squares"):
+            dae_jax.identify(
+                lambda p: model(p | {"length": 1.0}), {"angle": jnp.asarray(opposite + off)}, data, positive=False
+            )
+    found = dae_jax.identify(model, at(opposite - 0.5), data)
+    assert found.offset < 1e-3
+    np.testing.assert_allclose(model(found.params), data, atol=1e-9)
+    fixed = lambda angle: (
+        dae_jax.identify(lambda a: model({"length": 1.0, "angle": a}), angle, data, positive=False).params
+    )
+    ends = jax.vmap(fixed)(jnp.array([opposite, opposite - 0.5, opposite - 2]))
+    assert np.isnan(ends[0])
+    np.testing.assert_allclose(ends[1:], opposite - np.pi, atol=1e-9)
