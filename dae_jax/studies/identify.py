@@ -79,8 +79,8 @@ def identify(
     and of residuals larger than `sigma` allows. Such parameters keep what they were at the start, along the combination.
 
     Errors: `ValueError` or `TypeError` for data, parameters or a model that are not finite, not real, or not of the shape they
-    should have; `RuntimeError` where the minimum was not found but a maximum, or nothing in `steps`, or a solve with `throw=True` failed on the way. Under `jit` and
-    `vmap` there is no warning, and NaN in place of an error: a batch of
+    should have; `RuntimeError` where the minimum was not found, or what was found is a maximum, or a solve with `throw=True` failed
+    on the way. Under `jit` and `vmap` there is no warning, and NaN in place of an error: a batch of
     experiments is `jax.vmap(lambda d: identify(model, params, d))(data)`.
 
     Sources: G. A. F. Seber, C. J. Wild, *Nonlinear Regression*, ch. 2 and 3; that of the method and its end in

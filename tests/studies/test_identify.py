@@ -440,9 +440,9 @@ def test_a_maximum_is_no_end():
             dae_jax.identify(
                 lambda p: model(p | {"length": 1.0}), {"angle": jnp.asarray(opposite + off)}, data, positive=False
             )
-    found = dae_jax.identify(model, at(opposite - 0.5), data)
+    found = dae_jax.identify(model, at(opposite - 0.5), data, 0.1)
     assert found.offset < 1e-3
-    np.testing.assert_allclose(model(found.params), data, atol=1e-9)
+    np.testing.assert_allclose(model(found.params), data, atol=2e-4)
     fixed = lambda angle: (
         dae_jax.identify(lambda a: model({"length": 1.0, "angle": a}), angle, data, positive=False).params
     )
