@@ -142,7 +142,7 @@ def call(solve: "Solve", problem: Problem, steps: Float[Array, " steps"] | None 
         passed, determined, _ = found["passage"]
         result = RESULTS.where((result == RESULTS.successful) & ~jnp.asarray(determined), RESULTS.undetermined, result)
     seen = found["errors"].total if "errors" in found else None, passed, found.get("switches", False)
-    times = taken(found["ends"]) if "ends" in found else steps if solve.records_steps() else None
+    times = taken(found["ends"]) if "ends" in found else steps if solve.saves_steps() else None
     return sol.t0, sol.t1, ts["user"], ys["user"], interpolation, stats, result, sol.event_mask, seen, end, times
 
 

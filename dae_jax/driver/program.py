@@ -21,7 +21,7 @@ from ..equations.regularity import COARSE
 from ..equations.residual_form import LARGE
 from ..formulations import AbstractFormulation
 from ..solution import DAESolution
-from ..solvers import AbstractManifoldSolver, economical, replays, takes_residuals
+from ..solvers import AbstractManifoldSolver, economical, replays, takes_residuals, told_by_steps
 from ..types import Scalar, State
 from ..validate.captured import settled
 from ..validate.user_functions import refuse_wrong_functions, returned
@@ -247,7 +247,7 @@ class Solve:
         """
         adaptive = isinstance(self.controller, diffrax.AbstractAdaptiveStepSizeController)
         size = sum(leaf.size for leaf in jax.tree.leaves(problem.y0))
-        apart = self.derivative() == "reverse" and one_kernel_enabled() and not self.recording
+        apart = self.has_derivative_apart() and told_by_steps(self.solver)
         if not (adaptive and apart) or self.event is not None or self.max_steps is None or size > LARGE:
             return None
         saveat = diffrax.SaveAt(subs=diffrax.SubSaveAt(t1=True, fn=as_it_is))
@@ -288,12 +288,18 @@ class Solve:
             return "forward"
         return "reverse" if isinstance(self.adjoint, diffrax.RecursiveCheckpointAdjoint) else "any"
 
-    def records_steps(self) -> bool:
-        """Whether what is saved belongs to steps whose sizes are chosen on the way, and has a derivative that is a program of its own."""
+    def saves_steps(self) -> bool:
+        """Whether what is saved belongs to steps whose sizes are chosen on the way."""
         of_steps = self.saveat.dense or any(part.steps for part in saved_parts(self.saveat))
-        adaptive = isinstance(self.controller, diffrax.AbstractAdaptiveStepSizeController)
-        apart = self.derivative() == "reverse" and one_kernel_enabled() and not self.recording
-        return bool(of_steps and adaptive and apart)
+        return of_steps and isinstance(self.controller, diffrax.AbstractAdaptiveStepSizeController)
+
+    def has_derivative_apart(self) -> bool:
+        """Whether the derivative is a program of its own."""
+        return self.derivative() == "reverse" and one_kernel_enabled() and not self.recording
+
+    def records_steps(self) -> bool:
+        """Whether the steps are written down for the derivative."""
+        return self.saves_steps() and self.has_derivative_apart()
 
     def between(self) -> bool:
         """Whether points between steps are asked for."""

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import jax
@@ -165,6 +165,7 @@ class BDF(Replayable, AbstractResidualSolver):
 
     dense: bool = True
 
+    told_by_steps: ClassVar[bool] = False
     highest_index = 2
     default_index = 1
     interpolation_cls = NewtonPolynomial
