@@ -63,11 +63,11 @@ class LeadingMatrix:
         return jnp.stack([jnp.stack(signed_log_determinant(_entries(form, x, t, y, yd))) for x in self.blocks], 1)
 
 
-def _entries(form: Form, leading: _LeadingBlock, t: Time, y: Flat, yd: Flat) -> Float[Array, "n n"]:
+def _entries(form: Form, leading: _LeadingBlock, t: Time, y: Flat, yd: Flat) -> Float[Array, "block block"]:
     (rows, columns), orders = leading.block, np.array(leading.orders)
     columns = np.array(columns)
 
-    def by(order: int) -> Float[Array, "n n"]:
+    def by(order: int) -> Float[Array, "block block"]:
         point = [y, yd]
 
         def moved(x: Flat) -> Flat:
