@@ -29,7 +29,7 @@ from ..solvers import (
 from ..types import Time, Y
 from .bracket import bracketing
 from .crossings import OneCrossing, OnStates
-from .felt_steps import OneDirection, felt_steps
+from .felt_steps import SMALL, OneDirection, felt_steps
 from .followed_steps import RecordedEnds, at_steps, taken
 from .observed_steps import Observer, observed
 from .passages import passages
@@ -77,7 +77,7 @@ def call(solve: "Solve", problem: Problem, steps: Float[Array, " steps"] | None 
     decode = Decode(solve.formulation, solve.solver)
     solver, controller = economical(solve.solver, solve.between()), _fitted(solve.controller, t0, t1)
     _refuse_other_tolerances(controller, y)
-    felt = isinstance(solve.adjoint, OneDirection)
+    felt = SMALL * jax.lax.stop_gradient(jnp.abs(t1 - t0)) if isinstance(solve.adjoint, OneDirection) else None
     if takes_residuals(solver):
         solver, controller = _of_residuals(solver, controller)
         ode = dataclasses.replace(ode, felt=felt)
@@ -106,7 +106,7 @@ def call(solve: "Solve", problem: Problem, steps: Float[Array, " steps"] | None 
     saveat = dataclasses.replace(saveat, solver_state=True) if counts(solver) else saveat
     sums_errors = isinstance(controller, diffrax.ConstantStepSize) and not solve.recording
     observers: dict[str, Observer] = {"errors": SummedErrors()} if sums_errors else {}
-    if steps is None and (felt or solve.records_steps()):
+    if steps is None and (felt is not None or solve.records_steps()):
         assert solve.max_steps is not None
         observers["ends"] = RecordedEnds(solve.max_steps)
     passage = passages(problem, ode, solve.formulation.decode, not solve.keeps()[0], solve.formulation.inverts_mass)
@@ -115,8 +115,8 @@ def call(solve: "Solve", problem: Problem, steps: Float[Array, " steps"] | None 
     switches = stepped_over(problem) if steps is None and not solve.recording else None
     if switches is not None:
         observers["switches"] = switches
-    if felt and isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
-        controller = felt_steps(controller)
+    if felt is not None and isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
+        controller = felt_steps(controller, felt)
     controller = observed(controller if steps is None else at_steps(controller, steps), observers)
     saveat = dataclasses.replace(saveat, controller_state=True) if observers else saveat
     sol = diffrax.diffeqsolve(

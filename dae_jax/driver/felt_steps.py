@@ -15,8 +15,12 @@ from jax.flatten_util import ravel_pytree
 
 from ..compiler import equations
 from ..solvers import felt
-from ..types import State, Time, Y
+from ..types import Scalar, State, Time, Y
 from .observed_steps import AbstractStepsOf
+
+
+# In parts of the solve, steps in which round-off of a derivative, over the step, is no reason for smaller ones.
+SMALL = 1e-6
 
 
 class OneDirection(diffrax.ForwardMode):
@@ -24,10 +28,16 @@ class OneDirection(diffrax.ForwardMode):
 
 
 def some_change(y0: State, consistent: Callable[[State], State] | None) -> State:
-    """A change of all of a start, by no pattern, which stays `consistent` where this is given."""
+    """A change of all of a start, by no pattern, which stays `consistent` where this is given; 0 where no such is found, as with a
+    resistor of 0 Ω: then steps are those of the solution.
+    """
     numbers, tree = ravel_pytree(y0)
     change = tree((1 + jnp.abs(numbers)) * jnp.cos(1 + jnp.arange(numbers.size, dtype=numbers.dtype) ** 2))
-    return change if consistent is None else jax.jvp(consistent, (y0,), (change,))[1]
+    if consistent is None:
+        return change
+    change = jax.jvp(consistent, (y0,), (change,))[1]
+    found = jnp.all(jnp.isfinite(ravel_pytree(change)[0]))
+    return jax.tree.map(lambda x: jnp.where(found, x, 0), change)
 
 
 def by_felt_steps(solved: Callable[[State], Any], y0: State, change: State) -> Any:
@@ -39,19 +49,20 @@ def by_felt_steps(solved: Callable[[State], Any], y0: State, change: State) -> A
     return jax.jvp(solved, (y0,), (change,))[0]
 
 
-def felt_steps(controller: diffrax.AbstractAdaptiveStepSizeController) -> Any:
-    """The steps of a controller with tolerances, which gets the `felt` error."""
+def felt_steps(controller: diffrax.AbstractAdaptiveStepSizeController, smallest: Scalar) -> Any:
+    """The steps of a controller with tolerances, which gets the `felt` error of steps that are not smaller."""
     steps: Any = FeltSteps
-    return steps(controller)
+    return steps(controller, smallest)
 
 
 class FeltSteps(AbstractStepsOf):
     """Those of another controller with tolerances, which gets the `felt` error."""
 
     steps: Any
+    smallest: Scalar
 
     def wrap(self, direction: Any) -> Any:
-        return type(self)(self.steps.wrap(direction))  # pyright: ignore[reportCallIssue]
+        return type(self)(self.steps.wrap(direction), self.smallest)  # pyright: ignore[reportCallIssue]
 
     def init(
         self, terms: Any, t0: Time, t1: Time, y0: Y, dt0: Any, args: Any, func: Any, error_order: Any
@@ -69,5 +80,5 @@ class FeltSteps(AbstractStepsOf):
         error_order: Any,
         controller_state: Any,
     ) -> Any:
-        error = None if y_error is None else felt(y_error, y0, y1_candidate)
+        error = None if y_error is None else felt(y_error, y0, y1_candidate, t1 - t0 >= self.smallest)
         return self.steps.adapt_step_size(t0, t1, y0, y1_candidate, args, error, error_order, controller_state)

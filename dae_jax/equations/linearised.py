@@ -68,14 +68,14 @@ class JacobianStructure:
 class LinearisedResidual(eqx.Module):
     """J + c M with J = ∂F/∂y and M = ∂F/∂ẏ, of a residual. It travels through `diffrax.diffeqsolve` as `args`.
 
-    `start`: ẏ where a solve starts. `felt`: whether steps are to be short enough for forward derivatives too, which the program is
-    traced for.
+    `start`: ẏ where a solve starts. `felt`: the smallest steps that are to be short enough for forward derivatives too, where the
+    program is traced for these.
     """
 
     form: ResidualForm | Index1Form
     structure: JacobianStructure = eqx.field(static=True)
     start: Float[Array, " n"] | None = None
-    felt: bool = eqx.field(static=True, default=False)
+    felt: Scalar | None = None
 
     @classmethod
     def of(
