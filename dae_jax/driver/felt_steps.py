@@ -61,9 +61,6 @@ class FeltSteps(AbstractStepsOf):
     steps: Any
     smallest: Scalar
 
-    def wrap(self, direction: Any) -> Any:
-        return type(self)(self.steps.wrap(direction), self.smallest)  # pyright: ignore[reportCallIssue]
-
     def init(
         self, terms: Any, t0: Time, t1: Time, y0: Y, dt0: Any, args: Any, func: Any, error_order: Any
     ) -> tuple[Any, Any]:

@@ -66,9 +66,6 @@ class FollowedSteps(AbstractStepsOf):
     steps: Any
     times: Float[Array, " steps"]
 
-    def wrap(self, direction: Any) -> "FollowedSteps":
-        return type(self)(self.steps.wrap(direction), self.times)  # pyright: ignore[reportCallIssue]
-
     def init(
         self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, error_order: Any
     ) -> tuple[Any, _Followed]:

@@ -1,5 +1,6 @@
 """What is seen of the steps of a controller."""
 
+import dataclasses
 from typing import Any, NamedTuple, Protocol
 
 import diffrax
@@ -51,6 +52,9 @@ class AbstractStepsOf(diffrax.AbstractAdaptiveStepSizeController):
     """The steps of another controller with tolerances."""
 
     steps: eqx.AbstractVar[Any]
+
+    def wrap(self, direction: Any) -> Any:
+        return dataclasses.replace(self, steps=self.steps.wrap(direction))
 
     @property
     def rtol(self) -> Any:
