@@ -28,7 +28,7 @@ def one_kernel(
     derivative: Literal["forward", "reverse", "any"] = "any",
     pull_back: PullBack | None = None,
     forward: Callable[..., Any] | None = None,
-    way: Callable[..., Array] | None = None,
+    way: Callable[..., PyTree[Array]] | None = None,
 ) -> Callable[..., Any]:
     """`fn` (pytrees of arrays to a pytree of arrays), compiled to one kernel on the CPU or a GPU where it qualifies.
 
@@ -51,7 +51,7 @@ def _reverse(
     fn: Callable[..., Any],
     pull_back: PullBack | None,
     forward: Callable[..., Any],
-    way: Callable[..., Array] | None,
+    way: Callable[..., PyTree[Array]] | None,
 ) -> Callable[..., Any]:
     def flat(*args: PyTree) -> Any:
         leaves, treedef = jax.tree.flatten(args)

@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import optimistix
 from jax import lax
-from jaxtyping import Array, Float
 
 from .._compat import use_stepsize_tol
 from ..equations.manifold_ode import Equations, ManifoldODE
@@ -30,7 +29,8 @@ from ..types import Time, Y
 from .bracket import bracketing
 from .crossings import OneCrossing, OnStates
 from .felt_steps import SMALL, OneDirection, felt_steps
-from .followed_steps import RecordedEnds, at_steps, taken
+from .followed_formulas import KnownFormulas
+from .followed_steps import RecordedEnds, Steps, at_steps, taken
 from .observed_steps import Observer, observed
 from .passages import passages
 from .problem import Problem
@@ -68,9 +68,9 @@ class View(eqx.Module):
         return self.fn(t, self.decode(t, y, ode), self.args)
 
 
-def call(solve: "Solve", problem: Problem, steps: Float[Array, " steps"] | None = None) -> tuple[Any, ...]:
-    """`diffrax.diffeqsolve` on what the formulation makes of the problem; the fields of its solution, the end, and the times of its
-    steps where they are needed. `steps`: the times to take steps at.
+def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[Any, ...]:
+    """`diffrax.diffeqsolve` on what the formulation makes of the problem; the fields of its solution, the end, and its steps where
+    they are needed. `steps`: those to take.
     """
     t0, t1, dt0, args = problem.t0, problem.t1, problem.dt0, problem.args
     y, ode = solve.encoded(problem)
@@ -103,12 +103,19 @@ def call(solve: "Solve", problem: Problem, steps: Float[Array, " steps"] | None 
         on_states = lambda c, up: OnStates(c, decode, args, direction, up, given)
         conditions = jax.tree.map(on_states, event.cond_fn, event.direction, is_leaf=lambda x: x is None or callable(x))
         event = dataclasses.replace(event, cond_fn=conditions, root_finder=bracketing(event.root_finder))
-    saveat = dataclasses.replace(saveat, solver_state=True) if counts(solver) else saveat
+    saveat = dataclasses.replace(saveat, solver_state=True) if takes_residuals(solver) or counts(solver) else saveat
     sums_errors = isinstance(controller, diffrax.ConstantStepSize) and not solve.recording
     observers: dict[str, Observer] = {"errors": SummedErrors()} if sums_errors else {}
-    if steps is None and (felt is not None or solve.records_steps()):
+    looped, chooses = _for_loops(solve, solver, y, _real(event, t0, y, ode), t0, t1), False
+    records = steps is None and (felt is not None or solve.records_steps())
+    if records:
         assert solve.max_steps is not None
         observers["ends"] = RecordedEnds(solve.max_steps)
+    if takes_residuals(solver) and solve.max_steps is not None and (records or steps is not None):
+        looped, chooses = (
+            KnownFormulas(looped, solver, None if steps is None else steps.formulas, solve.max_steps),
+            True,
+        )
     passage = passages(problem, ode, solve.formulation.decode, not solve.keeps()[0], solve.formulation.inverts_mass)
     if passage is not None:
         observers["passage"] = passage
@@ -117,11 +124,11 @@ def call(solve: "Solve", problem: Problem, steps: Float[Array, " steps"] | None 
         observers["switches"] = switches
     if felt is not None and isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
         controller = felt_steps(controller, felt)
-    controller = observed(controller if steps is None else at_steps(controller, steps), observers)
+    controller = observed(controller if steps is None else at_steps(controller, steps.times), observers)
     saveat = dataclasses.replace(saveat, controller_state=True) if observers else saveat
     sol = diffrax.diffeqsolve(
         solve.formulation.term(),
-        _for_loops(solve, solver, y, _real(event, t0, y, ode), t0, t1),
+        looped,
         t0, t1, dt0, y,
         args=ode, saveat=saveat, stepsize_controller=controller, adjoint=solve.adjoint, event=event,
         max_steps=solve.max_steps, throw=False, progress_meter=solve.progress_meter,
@@ -135,15 +142,17 @@ def call(solve: "Solve", problem: Problem, steps: Float[Array, " steps"] | None 
     stats = {**sol.stats, "end_time": ts["end"][-1]}
     starts = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(y)]))
     result = RESULTS.where(starts, RESULTS.promote(sol.result), RESULTS.no_finite_start)
-    stats.update((path.split(".")[-1], operator.attrgetter(path)(sol.solver_state)) for path in counts(solver))
+    state: Any = sol.solver_state
+    state, formulas = (state.inner, state.formulas) if chooses else (state, None)
+    stats.update((path.split(".")[-1], operator.attrgetter(path)(state)) for path in counts(solver))
     found = lax.stop_gradient(cast(Any, sol.controller_state)).seen if observers else {}
     passed = False
     if "passage" in found:
         passed, determined, _ = found["passage"]
         result = RESULTS.where((result == RESULTS.successful) & ~jnp.asarray(determined), RESULTS.undetermined, result)
     seen = found["errors"].total if "errors" in found else None, passed, found.get("switches", False)
-    times = taken(found["ends"]) if "ends" in found else steps if solve.saves_steps() else None
-    return sol.t0, sol.t1, ts["user"], ys["user"], interpolation, stats, result, sol.event_mask, seen, end, times
+    ways = taken(found["ends"], formulas) if "ends" in found else steps if solve.saves_steps() else None
+    return sol.t0, sol.t1, ts["user"], ys["user"], interpolation, stats, result, sol.event_mask, seen, end, ways
 
 
 def _real(event: diffrax.Event | None, t: Time, y: Y, ode: Equations) -> list[OnStates]:

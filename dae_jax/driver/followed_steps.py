@@ -11,7 +11,7 @@ import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Int8
 
 from ..equations.manifold_ode import Equations
 from ..types import IntScalar, Scalar, Y
@@ -41,9 +41,28 @@ class RecordedEnds(eqx.Module):
         return Ends(before.count + step.kept, times)
 
 
-def taken(ends: Ends) -> Float[Array, " steps"]:
-    """The times at the ends of the steps that were accepted, and infinity."""
-    return lax.stop_gradient(jnp.where(jnp.arange(ends.times.size) <= ends.count, ends.times, jnp.inf))
+class Steps(NamedTuple):
+    """Steps to take: the times at their ends, that of the start first, then infinity; and their formulas, where a solver has several."""
+
+    times: Float[Array, " steps"]
+    formulas: Int8[Array, " steps"] | None
+
+
+def taken(ends: Ends, formulas: Int8[Array, " steps"] | None) -> Steps:
+    """The steps that were accepted."""
+    return Steps(lax.stop_gradient(jnp.where(jnp.arange(ends.times.size) <= ends.count, ends.times, jnp.inf)), formulas)
+
+
+def as_bits(steps: Steps) -> Steps:
+    """The times as integers, which have no derivative."""
+    kind = jnp.int64 if steps.times.dtype == jnp.float64 else jnp.int32
+    return steps._replace(times=lax.bitcast_convert_type(steps.times, kind))
+
+
+def of_bits(steps: Steps) -> Steps:
+    """The times as numbers again."""
+    kind = jnp.float64 if steps.times.dtype == jnp.int64 else jnp.float32
+    return steps._replace(times=lax.bitcast_convert_type(steps.times, kind))
 
 
 class _Followed(NamedTuple):

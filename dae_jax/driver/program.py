@@ -9,7 +9,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PyTree
+from jaxtyping import PyTree
 
 from .._compat import is_captured, lacks_reverse_derivatives, trace_state_clean
 from ..compiler import PullBack, inexact, one_kernel, one_kernel_enabled, waiting
@@ -21,7 +21,7 @@ from ..equations.regularity import COARSE
 from ..equations.residual_form import LARGE
 from ..formulations import AbstractFormulation
 from ..solution import DAESolution
-from ..solvers import AbstractManifoldSolver, economical, replays, takes_residuals, told_by_steps
+from ..solvers import AbstractManifoldSolver, economical, replays, takes_residuals
 from ..types import Scalar, State
 from ..validate.captured import settled
 from ..validate.user_functions import refuse_wrong_functions, returned
@@ -29,6 +29,7 @@ from .diffrax_call import Decode, View, call
 from .ends import look
 from .event_functions import refuse_wrong_event
 from .felt_steps import OneDirection, by_felt_steps, some_change
+from .followed_steps import Steps, as_bits, of_bits
 from .outcome import judged
 from .problem import Problem, Program, Split, split
 from .resets import Reset, solve_with_resets
@@ -65,24 +66,11 @@ def _jitted(program: Program, arrays: Arrays) -> Any:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _numbers(program: Program, arrays: Arrays, steps: Array | None = None) -> Split:
+def _numbers(program: Program, arrays: Arrays, steps: Steps | None = None) -> Split:
     """diffrax's part of a solve; jitted, so that derivatives and batches of it find it traced."""
     solve, problem = program.whole(arrays)
     with settled(program.leaves):
-        return Split.of(call(solve, problem, None if steps is None else _as_times(steps)))
-
-
-def _of_steps(result: Split) -> Array:
-    """The times of the steps, as numbers without a derivative."""
-    return _as_bits(result.numbers[-1])
-
-
-def _as_bits(times: Array) -> Array:
-    return jax.lax.bitcast_convert_type(times, jnp.int64 if times.dtype == jnp.float64 else jnp.int32)
-
-
-def _as_times(bits: Array) -> Array:
-    return jax.lax.bitcast_convert_type(bits, jnp.float64 if bits.dtype == jnp.int64 else jnp.float32)
+        return Split.of(call(solve, problem, None if steps is None else of_bits(steps)))
 
 
 def run(program: Program, arrays: Arrays) -> tuple[DAESolution, Any, float]:
@@ -137,7 +125,7 @@ class Solve:
         numbers, arrays = self.kernel(problem)
         forward, _ = self.forwards().kernel(problem)
         pull_back = self._pull_back(problem)
-        way = (lambda args, result: _of_steps(result)) if self.records_steps() else self._felt_steps(problem)
+        way = (lambda args, result: as_bits(result.numbers[-1])) if self.records_steps() else self._felt_steps(problem)
         *fields, end, _ = one_kernel(numbers, self.derivative(), pull_back, forward, way)(arrays).whole()
         check, check_arrays = self._check(problem, end)
         # A yes or no has no derivative.
@@ -200,7 +188,7 @@ class Solve:
         """What can become one kernel: a function of arrays, and of the steps to take, if that is known; and its arrays."""
         program, arrays = split((self, problem))
 
-        def numbers(arrays: Arrays, *steps: Array) -> Split:
+        def numbers(arrays: Arrays, *steps: Steps) -> Split:
             # JAX's derivatives name the (empty) mesh, and would trace anew what was traced without a name for it.
             with jax.sharding.use_abstract_mesh(jax.sharding.get_abstract_mesh()):
                 return _numbers(program, arrays, *steps)
@@ -241,26 +229,30 @@ class Solve:
 
         return pull_back
 
-    def _felt_steps(self, problem: Problem) -> Callable[..., Array] | None:
+    def _felt_steps(self, problem: Problem) -> Callable[..., Steps] | None:
         """The steps of derivatives, which are the same for all of them: in the sum of a second derivative's parts, what leads off
         the manifold cancels only if these have the same steps.
         """
         adaptive = isinstance(self.controller, diffrax.AbstractAdaptiveStepSizeController)
         size = sum(leaf.size for leaf in jax.tree.leaves(problem.y0))
-        apart = self.has_derivative_apart() and told_by_steps(self.solver)
-        if not (adaptive and apart) or self.event is not None or self.max_steps is None or size > LARGE:
+        if (
+            not (adaptive and self.has_derivative_apart())
+            or self.event is not None
+            or self.max_steps is None
+            or size > LARGE
+        ):
             return None
         saveat = diffrax.SaveAt(subs=diffrax.SubSaveAt(t1=True, fn=as_it_is))
         program, _ = split((self, problem))
 
-        def steps(arrays: Arrays, change: State) -> Array:
+        def steps(arrays: Arrays, change: State) -> Steps:
             with settled(program.leaves):
                 solve, problem = program.whole(arrays)
                 solve = dataclasses.replace(solve, adjoint=OneDirection(), saveat=saveat)
                 solved = lambda y0: call(solve, dataclasses.replace(problem, y0=y0))[-1]
-                return _as_bits(by_felt_steps(solved, problem.y0, change))
+                return as_bits(by_felt_steps(solved, problem.y0, change))
 
-        def way(args: tuple[Arrays], _: Split) -> Array:
+        def way(args: tuple[Arrays], _: Split) -> Steps:
             (arrays,) = jax.lax.stop_gradient(args)
             _, problem = program.whole(arrays)
             consistent = lambda y: consistent_state(problem.system, problem.t0, y, problem.args)

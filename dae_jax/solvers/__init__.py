@@ -7,7 +7,6 @@ from .abilities import (
     is_recomputable as is_recomputable,
     replays as replays,
     takes_residuals as takes_residuals,
-    told_by_steps as told_by_steps,
 )
 from .bdf import BDF as BDF
 from .dop853 import DOP853 as DOP853

@@ -41,12 +41,6 @@ def replays(solver: diffrax.AbstractSolver) -> bool:
     return isinstance(solver, Replayable) and (inner is None or is_explicit(inner) or replays(inner))
 
 
-def told_by_steps(solver: diffrax.AbstractSolver) -> bool:
-    """Whether a solver does the same again on the same steps, whatever its errors were: not one whose order is chosen by them."""
-    inner = getattr(solver, "solver", None)
-    return getattr(solver, "told_by_steps", True) and (inner is None or told_by_steps(inner))
-
-
 def takes_residuals(solver: diffrax.AbstractSolver) -> TypeIs[AbstractResidualSolver]:
     """Whether a solver works on 0 = F(t, y, ẏ) in place of an ODE."""
     return isinstance(solver, AbstractResidualSolver)

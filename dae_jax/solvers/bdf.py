@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import jax
@@ -165,7 +165,6 @@ class BDF(Replayable, AbstractResidualSolver):
 
     dense: bool = True
 
-    told_by_steps: ClassVar[bool] = False
     highest_index = 2
     default_index = 1
     interpolation_cls = NewtonPolynomial
@@ -189,6 +188,13 @@ class BDF(Replayable, AbstractResidualSolver):
 
     def invalidate_jacobian(self, state: _State) -> _State:
         return state._replace(c=jnp.zeros_like(state.c))
+
+    def formula(self, state: _State) -> Int[Array, ""]:
+        return state.order
+
+    def by_formula(self, state: _State, formula: Int[Array, ""]) -> _State:
+        # Without a history there is that of order 1 only.
+        return state._replace(order=jnp.where(state.steps == 0, state.order, formula))
 
     def step(
         self,

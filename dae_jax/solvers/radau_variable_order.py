@@ -99,6 +99,12 @@ class Radau(Replayable, AbstractResidualSolver):
     def invalidate_jacobian(self, state: _State) -> _State:
         return state._replace(within=self.methods[-1].invalidate_jacobian(state.within))
 
+    def formula(self, state: _State) -> Int[Array, ""]:
+        return state.which
+
+    def by_formula(self, state: _State, formula: Int[Array, ""]) -> _State:
+        return state._replace(which=formula, within=_changed(state.within, state.which, formula))
+
     def step(
         self,
         terms: diffrax.AbstractTerm,
@@ -124,12 +130,8 @@ class Radau(Replayable, AbstractResidualSolver):
 
         y1, error, z, new, result = lax.switch(state.which, [lambda m=m: by(m) for m in self.methods])
         which, kept = _next(state, new)
-        z_at_nodes = lax.cond(which == state.which, lambda: new.z, lambda: _sampled(new.z, state.which, which))
-        # The factors are those of a method.
-        factored = jnp.where(which == state.which, new.factored, 0)
         dense = {"y0": y0, "z": z, "which": state.which.astype(y0.dtype)}
-        new = new._replace(z=constant(z_at_nodes), factored=factored)
-        return y1, error, dense, _State(new, which, kept), result
+        return y1, error, dense, _State(_changed(new, state.which, which), which, kept), result
 
     def replay(
         self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any, history: Any, dense: Any
@@ -150,6 +152,13 @@ def _next(state: _State, new: RadauState) -> tuple[Int[Array, ""], Int[Array, ""
     falls = (corrections > 1) & (new.eta >= FALL) & (new.eta < ROUND_OFF) & (state.which > 0)
     which = state.which + rises - falls
     return which, jnp.where(which == state.which, state.kept + 1, 0)
+
+
+def _changed(state: RadauState, before: Int[Array, ""], after: Int[Array, ""]) -> RadauState:
+    """What a step by one method leaves to a step by another."""
+    z_at_nodes = lax.cond(after == before, lambda: state.z, lambda: _sampled(state.z, before, after))
+    # The factors are those of a method.
+    return state._replace(z=constant(z_at_nodes), factored=jnp.where(after == before, state.factored, 0))
 
 
 def _filled(z: Float[Array, "s n"]) -> Float[Array, "7 n"]:

@@ -85,6 +85,14 @@ class AbstractResidualSolver(diffrax.AbstractAdaptiveSolver):
     def invalidate_jacobian(self, state: Any) -> Any:
         """The solver's state without its iteration matrix, for equations that are others now for the same unknowns."""
 
+    def formula(self, state: Any) -> Int[Array, ""] | None:
+        """The number, up to 127, of the formula that the next step is made by; None where all are made by one."""
+        return None
+
+    def by_formula(self, state: Any, formula: Int[Array, ""]) -> Any:
+        """The state from which the next step is made by the formula of this number."""
+        return state
+
 
 class Tolerances(NamedTuple):
     """`rtol`, `atol`; what Newton's method may leave, as a part of these: `newton`, and `roundoff` where it gets no

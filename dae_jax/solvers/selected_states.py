@@ -149,6 +149,12 @@ class SelectedResiduals(Replayable, AbstractResidualSolver):
     def invalidate_jacobian(self, state: Selection) -> Selection:
         return state._replace(inner=self.solver.invalidate_jacobian(state.inner))
 
+    def formula(self, state: Selection) -> Any:
+        return self.solver.formula(state.inner)
+
+    def by_formula(self, state: Selection, formula: Any) -> Selection:
+        return state._replace(inner=self.solver.by_formula(state.inner, formula))
+
     def step(
         self,
         terms: diffrax.AbstractTerm,
