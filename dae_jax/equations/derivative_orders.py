@@ -339,4 +339,7 @@ def _singular(form: Form, singular: StructurallySingular) -> str:
     ):
         if places:
             parts.append(f"the {kind} {in_short([of[k] for k in places])} have too few {lack} between them")
-    return f"The system is structurally singular: {'; '.join(parts)}."
+    redundant = (
+        " Redundant equations, such as constraints that follow from others, do that." if singular.equations else ""
+    )
+    return f"The system is structurally singular: {'; '.join(parts)}.{redundant}"

@@ -130,8 +130,16 @@ class Mechanism(eqx.Module):
     def system(self, rank: int | tuple[int, int] | None = None) -> ConstrainedSystem:
         """The equations as `daesolve` takes them; `rank` as that of `ConstrainedSystem`, which only a start that is traced needs
         where equations are redundant: `Mechanism.rank` finds it.
+
+        Errors: `ValueError` in the plane without a joint.
         """
         position, velocity = self._shapes()
+        if self.dimension == 2 and not sum(position) + sum(velocity):
+            bodies = ", ".join(body.name for body in self.bodies)
+            raise ValueError(
+                f"Nothing constrains this mechanism (bodies: {bodies}): in the plane it needs a joint. Without one its motion is an ODE, "
+                "v̇ = force / mass, which `diffrax.diffeqsolve` solves."
+            )
         return ConstrainedSystem(
             self.force,
             self.constraint if sum(position) or self.dimension == 3 else None,

@@ -81,6 +81,12 @@ def test_a_rate_that_no_joint_allows_is_refused():
         held.assemble(rates={"hinge": 1.0})
 
 
+def test_without_a_joint():
+    with pytest.raises(ValueError, match=r"Nothing constrains this mechanism \(bodies: rod\)"):
+        m.Mechanism([ROD]).system()
+    m.Mechanism([BLOCK]).system()
+
+
 def test_names_of_outputs():
     mechanism = m.Mechanism([ROD], [m.revolute(m.ground, ROD, (0, 0), name="hinge")])
     q, _ = mechanism.reference

@@ -211,6 +211,9 @@ def test_an_equation_given_twice_is_no_equation():
 
 def test_redundant_constraints_are_singular():
     assert not of_scene("four-bar-redundant").regular
+    twice = dae_jax.ConstrainedSystem(lambda t, q, v, a: -q, lambda t, q, a: jnp.stack([q @ q - 1] * 3))
+    with pytest.raises(ValueError, match=r"constraint\[0\].*constraints that follow from others"):
+        dae_jax.analyse(twice, 0.0, (jnp.array([1.0, 0.0]), jnp.zeros(2)))
 
 
 def test_structurally_singular_systems_are_named():
