@@ -103,19 +103,17 @@ def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[
         on_states = lambda c, up: OnStates(c, decode, args, direction, up, given)
         conditions = jax.tree.map(on_states, event.cond_fn, event.direction, is_leaf=lambda x: x is None or callable(x))
         event = dataclasses.replace(event, cond_fn=conditions, root_finder=bracketing(event.root_finder))
-    saveat = dataclasses.replace(saveat, solver_state=True) if takes_residuals(solver) or counts(solver) else saveat
     sums_errors = isinstance(controller, diffrax.ConstantStepSize) and not solve.recording
     observers: dict[str, Observer] = {"errors": SummedErrors()} if sums_errors else {}
-    looped, chooses = _for_loops(solve, solver, y, _real(event, t0, y, ode), t0, t1), False
+    looped = _for_loops(solve, solver, y, _real(event, t0, y, ode), t0, t1)
     records = steps is None and (felt is not None or solve.records_steps())
     if records:
         assert solve.max_steps is not None
         observers["ends"] = RecordedEnds(solve.max_steps)
-    if takes_residuals(solver) and solve.max_steps is not None and (records or steps is not None):
-        looped, chooses = (
-            KnownFormulas(looped, solver, None if steps is None else steps.formulas, solve.max_steps),
-            True,
-        )
+    if takes_residuals(solver) and (records or steps is not None):
+        looped = KnownFormulas(looped, solver, None if steps is None else steps.formulas, solve.max_steps or 0)
+    state_is_read = isinstance(looped, KnownFormulas) or counts(solver)
+    saveat = dataclasses.replace(saveat, solver_state=True) if state_is_read else saveat
     passage = passages(problem, ode, solve.formulation.decode, not solve.keeps()[0], solve.formulation.inverts_mass)
     if passage is not None:
         observers["passage"] = passage
@@ -143,7 +141,7 @@ def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[
     starts = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(y)]))
     result = RESULTS.where(starts, RESULTS.promote(sol.result), RESULTS.no_finite_start)
     state: Any = sol.solver_state
-    state, formulas = (state.inner, state.formulas) if chooses else (state, None)
+    state, formulas = (state.inner, state.formulas) if isinstance(looped, KnownFormulas) else (state, None)
     stats.update((path.split(".")[-1], operator.attrgetter(path)(state)) for path in counts(solver))
     found = lax.stop_gradient(cast(Any, sol.controller_state)).seen if observers else {}
     passed = False

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, Int8
@@ -44,7 +45,7 @@ class RecordedEnds(eqx.Module):
 class Steps(NamedTuple):
     """Steps to take: the times at their ends, that of the start first, then infinity; and their formulas, where a solver has several."""
 
-    times: Float[Array, " steps"]
+    times: Float[Array, " ends"] | Int[Array, " ends"]
     formulas: Int8[Array, " steps"] | None
 
 
@@ -104,11 +105,12 @@ class FollowedSteps(AbstractStepsOf):
         controller_state: _Followed,
     ) -> Any:
         state, count, end = controller_state
-        keep, next_t0, _, made_jump, state, _ = self.steps.adapt_step_size(
-            t0, t1, y0, y1_candidate, args, y_error, error_order, state
+        # With an error of 0 the controller accepts the step, too, and sees where it made a jump.
+        none = jax.tree.map(jnp.zeros_like, y_error)
+        _, next_t0, _, made_jump, state, _ = self.steps.adapt_step_size(
+            t0, t1, y0, y1_candidate, args, none, error_order, state
         )
         count = count + 1
-        next_t0 = jnp.where(keep, next_t0, t1)
         # A solve that failed goes no further.
         goes_on = (t1 >= end) | jnp.isfinite(self.times[count + 1])
         failed: Any = diffrax.RESULTS.dt_min_reached
