@@ -189,7 +189,9 @@ def offsets_of(form: Form, dtype: DType) -> Offsets:
     try:
         found = Offsets(by_y, by_rate, rows, sigma_method(rows))
     except StructurallySingular as singular:
-        raise ValueError(_singular(form, singular)) from None
+        equations = in_short([form.equations[i] for i in singular.equations])
+        variables = in_short([form.variables[j] for j in singular.variables])
+        raise ValueError(singular.sentence(equations, variables)) from None
     slopes = functools.cache(lambda degree: Slopes(form.residual, found.variables, degree, dtype).as_polynomials())
     while form.may_cancel and (better := _combined(slopes, found)):
         found = better
@@ -329,17 +331,3 @@ def derivative_of(equation: str, times: int) -> str:
 def _sign(factor: float, place: int) -> str:
     sign = (" + ", " − ") if place else ("", "−")
     return sign[factor < 0] + ("" if abs(factor) == 1 else f"{abs(factor):.4g}·")
-
-
-def _singular(form: Form, singular: StructurallySingular) -> str:
-    parts = []
-    for kind, places, of, lack in (
-        ("equations", singular.equations, form.equations, "variables"),
-        ("variables", singular.variables, form.variables, "equations"),
-    ):
-        if places:
-            parts.append(f"the {kind} {in_short([of[k] for k in places])} have too few {lack} between them")
-    redundant = (
-        " Redundant equations, such as constraints that follow from others, do that." if singular.equations else ""
-    )
-    return f"The system is structurally singular: {'; '.join(parts)}.{redundant}"

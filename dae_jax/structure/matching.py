@@ -26,12 +26,19 @@ class StructurallySingular(ValueError):
     def __init__(self, equations: Iterable[int], variables: Iterable[int]) -> None:
         self.equations = tuple(sorted(equations))
         self.variables = tuple(sorted(variables))
+        numbers = (f"[{in_short(places)}]" if places else "" for places in (self.equations, self.variables))
+        super().__init__(self.sentence(*numbers))
+
+    @staticmethod
+    def sentence(equations: str, variables: str) -> str:
+        """What is singular, in words for the equations and the variables, empty where there are none."""
         parts = []
-        if self.equations:
-            parts.append(f"the equations [{in_short(self.equations)}] have too few variables between them")
-        if self.variables:
-            parts.append(f"the variables [{in_short(self.variables)}] have too few equations between them")
-        super().__init__(f"The system is structurally singular: {'; '.join(parts)}.")
+        if equations:
+            parts.append(f"the equations {equations} have too few variables between them")
+        if variables:
+            parts.append(f"the variables {variables} have too few equations between them")
+        redundant = " Redundant equations, such as constraints that follow from others, do that." if equations else ""
+        return f"The system is structurally singular: {'; '.join(parts)}.{redundant}"
 
 
 def in_short(names: Collection[object]) -> str:
