@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -24,7 +23,7 @@ from .systems import System, is_mechanism
 from .tables import table
 from .types import Args, Flat, State, Time
 from .validate.captured import current
-from .validate.states import counted, refuse_wrong_state
+from .validate.states import as_floats, counted, refuse_wrong_state
 from .validate.user_functions import at_numbers, refuse_wrong_functions
 
 
@@ -236,7 +235,7 @@ def analyse(system: System, t0: Time, y0: State, args: Args = None) -> Structure
     """
     refuse_wrong_state(system, y0)
     system, args = current((system, args))
-    y0 = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
+    y0 = as_floats(y0)
     refuse_wrong_functions(system, t0, y0, args)
     form = ResidualForm.of(system, t0, y0, args)
     y = form.encode(y0)

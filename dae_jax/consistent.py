@@ -10,7 +10,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, PyTree
 
 from .compiler import at_ease
-from .equations.constraint_jacobian import dense_mass, mass_solve, of_rows
+from .equations.constraint_jacobian import dense_mass, of_free, shortest
 from .equations.initial_rates import is_nonlinear, rates_of
 from .equations.linearised import LinearisedResidual
 from .equations.mechanical import MechanicalODE
@@ -23,7 +23,7 @@ from .systems import ConstrainedSystem, System, is_mechanism
 from .types import Args, Phase, State, Time
 from .validate.captured import current
 from .validate.closures import opened
-from .validate.states import broadcast_to_state, refuse_wrong_state, with_rates
+from .validate.states import as_floats, broadcast_to_state, refuse_wrong_state, with_rates
 from .validate.user_functions import refuse_wrong_functions
 
 
@@ -154,7 +154,7 @@ def consistent_state(
     """
     refuse_wrong_state(system, y0)
     system, args = opened(current((with_rates(system, yd0, y0), args)))
-    y0 = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
+    y0 = as_floats(y0)
     refuse_wrong_functions(system, t0, y0, args)
     masks = jax.tree.map(lambda x: jnp.zeros_like(x, dtype=bool), y0)
     if fixed is not None:
@@ -204,7 +204,7 @@ def _nearest(ode: MechanicalODE, t: Time, y: Phase, free: Phase) -> Any:
     def iterate(params: PyTree) -> Any:
         ode, _, (q0, v0), (of_q, _) = params
         start = jnp.concatenate([q0, v0])
-        mass = _of_free(dense_mass(ode.mass(q0)), of_q)
+        mass = of_free(dense_mass(ode.mass(q0)), of_q)
         near = nearest_point(
             lambda x, aim: _improved(x, aim, params),
             start,
@@ -235,28 +235,8 @@ def _improved(x: Float[Array, " 2n"], aim: Float[Array, " 2n"], params: PyTree) 
     m = ode.holonomic
     a, mass = ode.constraint_jacobian(t, q, v), ode.mass(q0)
     g, _ = ode.invariants(t, (q, v))
-    if m:
-        towards = aim[: q.size]
-        q = towards - _least_norm(a[:m], mass, of_q, g + jnp.dot(a[:m], towards - q))
+    towards = aim[: q.size]
+    q = towards - shortest(a[:m], mass, of_q, g + jnp.dot(a[:m], towards - q)) if m else towards
     _, h = ode.invariants(t, (q, v))
-    v = v0 - _least_norm(a, mass, of_v, h + jnp.dot(a, v0 - v))
+    v = v0 - shortest(a, mass, of_v, h + jnp.dot(a, v0 - v))
     return jnp.concatenate([q, v])
-
-
-def _least_norm(
-    a: Float[Array, "c n"], mass: Float[Array, "..."] | None, free: Float[Array, " n"], b: Float[Array, " c"]
-) -> Float[Array, " n"]:
-    """The shortest x with A x = b in the metric of the mass matrix, where entries that are not `free` stay 0."""
-    n = mass_solve(_of_free(mass, free), (a * free).T)
-    schur = jnp.dot(a, n)
-    cut = float(jnp.finfo(schur.dtype).eps) ** 0.5
-    return jnp.dot(n, jnp.dot(jnp.linalg.pinv(schur, rtol=cut, hermitian=True), b))
-
-
-def _of_free(mass: Float[Array, "..."] | None, free: Float[Array, " n"]) -> Float[Array, "..."] | None:
-    """The mass matrix of the entries that are free, for the others the unit matrix."""
-    if mass is None or mass.ndim < 2:
-        return mass
-    if mass.ndim == 3:
-        return jax.vmap(of_rows)(mass, free.reshape(mass.shape[:2]))
-    return of_rows(mass, free)

@@ -25,7 +25,7 @@ from .solution import DAESolution, at_saved_times
 from .systems import ConstrainedSystem, ImplicitDAE, SemiExplicitDAE, System, is_mechanism
 from .types import Args, Phase, State, Time
 from .validate.captured import current
-from .validate.states import brief, refuse_wrong_state, refuse_wrong_system
+from .validate.states import as_floats, brief, refuse_wrong_state, refuse_wrong_system
 from .validate.user_functions import refuse_no_real_number, refuse_wrong_functions, returned
 
 
@@ -115,7 +115,7 @@ def multipliers(system: ConstrainedSystem, *at: Any) -> Any:
     if len(at) not in (3, 4):
         raise TypeError("`multipliers` takes (system, sol) or (system, t, q, v, args).")
     t, q, v, *args = current(at)
-    state = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), (q, v))
+    state = as_floats((q, v))
     refuse_wrong_state(system, state)
     ode = MechanicalODE.of(system, t, state, args[0] if args else None)
     y = ode.encode(state)

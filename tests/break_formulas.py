@@ -182,7 +182,7 @@ BREAKS = {
         f"{_FORMULAS}::test_rolling_is_a_constraint_of_velocities",
     ),
     "consistent state: fixed velocities": Break(
-        "consistent.py", "_least_norm(a, mass, of_v, h", "_least_norm(a, mass, of_q, h",
+        "consistent.py", "shortest(a, mass, of_v, h", "shortest(a, mass, of_q, h",
         f"{_FORMULAS}::test_consistent_velocities_keep_what_is_fixed",
     ),
     "accelerations: sign of the bias": Break(

@@ -14,9 +14,11 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from ..compiler import equations
+from ..equations.consistent_change import consistent_change
 from ..solvers import felt
 from ..types import Scalar, State, Time, Y
 from .observed_steps import AbstractStepsOf
+from .problem import Problem
 
 
 # In parts of the solve, steps in which round-off of a derivative, over the step, is no reason for smaller ones.
@@ -27,15 +29,16 @@ class OneDirection(diffrax.ForwardMode):
     """Forward derivatives along one direction, by steps that are short enough for it: those of the solution are the same."""
 
 
-def some_change(y0: State, consistent: Callable[[State], State] | None) -> State:
-    """A change of all of a start, by no pattern, which stays `consistent` where this is given; 0 where no such is found, as with a
+def some_change(problem: Problem, consistent: bool) -> State:
+    """A change of all of a start, by no pattern, which stays `consistent` where this is asked for; 0 where no such is found, as with a
     resistor of 0 Ω: then steps are those of the solution.
     """
+    system, t0, y0, args = problem.start
     numbers, tree = ravel_pytree(y0)
     change = tree((1 + jnp.abs(numbers)) * jnp.cos(1 + jnp.arange(numbers.size, dtype=numbers.dtype) ** 2))
-    if consistent is None:
+    if not consistent:
         return change
-    change = jax.jvp(consistent, (y0,), (change,))[1]
+    change = consistent_change(system, t0, y0, change, args)
     found = jnp.all(jnp.isfinite(ravel_pytree(change)[0]))
     return jax.tree.map(lambda x: jnp.where(found, x, 0), change)
 

@@ -15,7 +15,6 @@ from .._compat import is_captured, lacks_reverse_derivatives, trace_state_clean
 from ..compiler import PullBack, inexact, one_kernel, one_kernel_enabled, waiting
 from ..compiler.kernel_call import as_kernel
 from ..compiler.types import Arrays
-from ..consistent import consistent_state
 from ..equations.independent import independent
 from ..equations.regularity import COARSE
 from ..equations.residual_form import LARGE
@@ -255,9 +254,7 @@ class Solve:
         def way(args: tuple[Arrays], _: Split) -> Steps:
             (arrays,) = jax.lax.stop_gradient(args)
             _, problem = program.whole(arrays)
-            consistent = lambda y: consistent_state(problem.system, problem.t0, y, problem.args)
-            change = some_change(problem.y0, consistent if takes_residuals(self.solver) else None)
-            return as_kernel(steps)(arrays, change)
+            return as_kernel(steps)(arrays, some_change(problem, takes_residuals(self.solver)))
 
         return way
 

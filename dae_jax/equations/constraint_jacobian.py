@@ -234,6 +234,25 @@ def of_rows(s: Float[Array, "c c"], kept: Float[Array, " c"]) -> Float[Array, "c
     return s * kept[:, None] * kept + jnp.eye(len(s), dtype=s.dtype) * (1 - kept)
 
 
+def shortest(
+    a: Float[Array, "c n"], mass: Float[Array, "..."] | None, free: Float[Array, " n"], b: Float[Array, " c"]
+) -> Float[Array, " n"]:
+    """The shortest x with A x = b in the metric of the mass matrix, where entries that are not `free` stay 0."""
+    n = mass_solve(of_free(mass, free), (a * free).T)
+    schur = jnp.dot(a, n)
+    cut = float(jnp.finfo(schur.dtype).eps) ** 0.5
+    return jnp.dot(n, jnp.dot(jnp.linalg.pinv(schur, rtol=cut, hermitian=True), b))
+
+
+def of_free(mass: Float[Array, "..."] | None, free: Float[Array, " n"]) -> Float[Array, "..."] | None:
+    """The mass matrix of the entries that are free, for the others the unit matrix."""
+    if mass is None or mass.ndim < 2:
+        return mass
+    if mass.ndim == 3:
+        return jax.vmap(of_rows)(mass, free.reshape(mass.shape[:2]))
+    return of_rows(mass, free)
+
+
 def unit_diagonal(s: Float[Array, "c c"]) -> Float[Array, " c"]:
     """d that makes the diagonal of diag(d) S diag(d) ±1, or leaves a 0."""
     diagonal = jnp.abs(jnp.diagonal(s))

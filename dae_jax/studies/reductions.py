@@ -2,18 +2,22 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ..compiler import at_ease
-from ..consistent import consistent_state
 from ..diagnostics import drift, energy
 from ..driver.felt_steps import OneDirection
+from ..equations.consistent_change import consistent_change
 from ..solution import RESULTS, DAESolution
 from ..solve import daesolve
 from ..systems import ConstrainedSystem, System
 from ..types import Args, Solver, State, Time
+from ..validate.captured import current
+from ..validate.closures import opened
+from ..validate.states import as_floats, broadcast_to_state, refuse_wrong_state
 
 
 def final_state(sol: DAESolution) -> Any:
@@ -77,13 +81,17 @@ def lyapunov(
     those of `daesolve`, but for `event`, `saveat` and `adjoint`. Steps are chosen for δy as for the solution. NaN where a solve with
     `throw=False` failed. Derivatives of the exponent are found in forward mode (`jax.jacfwd`).
 
-    Errors: `TypeError` for one of these three.
+    Errors: `TypeError` for one of these three; `ValueError` for a direction of another structure.
     """
     for name in ("event", "saveat", "adjoint"):
         if name in options:
             raise TypeError(f"`lyapunov` takes no `{name}`: the exponent is that of the whole time from t0 to t1.")
-    along = jax.tree.map(jnp.ones_like, y0) if direction is None else direction
-    _, start = jax.jvp(lambda y: consistent_state(system, t0, y, args), (y0,), (along,))
+    refuse_wrong_state(system, y0)
+    y0 = as_floats(y0)
+    along = jax.tree.map(jnp.ones_like, y0)
+    if direction is not None:
+        along = broadcast_to_state("direction", direction, y0, "numbers")
+    start = _consistent_change(*opened(current((system, t0, y0, as_floats(along), args))))
 
     def end(y: State) -> tuple[Any, DAESolution]:
         sol = daesolve(
@@ -94,6 +102,9 @@ def lyapunov(
 
     _, last, sol = jax.jvp(end, (y0,), (start,), has_aux=True)
     return _where_it_went_well(sol, jnp.log(_norm(last) / _norm(start)) / (t1 - t0), jnp.nan)
+
+
+_consistent_change = eqx.filter_jit(consistent_change)
 
 
 def _where_it_went_well(sol: DAESolution, value: Float[Array, ""], otherwise: float) -> Float[Array, ""]:

@@ -81,6 +81,11 @@ def refuse_wrong_state(system: System, y0: State, name: str = "y0") -> None:
             raise TypeError(f"`{name}` must hold arrays of floating-point numbers, but holds {brief(leaf)}.")
 
 
+def as_floats(state: State) -> Any:
+    """The state as arrays, whole numbers as floating-point ones."""
+    return jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), state)
+
+
 def _how_to_split(y0: State, name: str) -> str:
     """Advice for a vector in which v is behind q."""
     flat = isinstance(y0, jax.Array | np.ndarray) and np.ndim(y0) == 1 and np.size(y0) % 2 == 0

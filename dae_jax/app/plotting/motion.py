@@ -14,7 +14,7 @@ from ...scenes import Drawing, Scene
 from ...solution import AccuracyWarning, DAESolution
 from ...systems import System, is_mechanism
 from ...types import State, Time
-from ...validate.states import brief
+from ...validate.states import as_floats, brief
 
 
 # Frames in a second of a film, and in all at most. One that is shorter than SHORT or longer than LONG in real time takes
@@ -109,13 +109,9 @@ def motion(
     def velocity(t: Time, q: State, v: State) -> Array:
         return jax.jvp(drawing.points, (t, q), (jnp.ones_like(t), v))[1]
 
-    rates = np.asarray(jax.jit(jax.vmap(velocity))(jnp.asarray(times), *map(_arrays, ys)))
+    rates = np.asarray(jax.jit(jax.vmap(velocity))(jnp.asarray(times), *map(as_floats, ys)))
     _warn_of_gaps(times, points, rates)
     return _cubic(times, points, rates, at)
-
-
-def _arrays(state: State) -> State:
-    return jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), state)
 
 
 def _is_pair(system: System | None, ys: State) -> bool:
