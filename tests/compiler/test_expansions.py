@@ -28,7 +28,12 @@ def hermitian(n, dtype):
 def assert_expanded(fn, *args):
     """The function is compiled by us, and gives what JAX gives."""
     assert jit(fn).lower(*args).compiler == "llvm"
-    for x, y in zip(jax.tree.leaves(jit(fn)(*args)), jax.tree.leaves(jax.jit(fn)(*args)), strict=True):
+    assert_same(jit(fn)(*args), jax.jit(fn)(*args))
+
+
+def assert_same(found, expected):
+    """Equal to rounding."""
+    for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         assert x.dtype == y.dtype
         scale = np.max(np.abs(y), initial=0, where=np.isfinite(y)) if y.dtype.kind in "fc" else 0
         np.testing.assert_allclose(x, y, rtol=0, atol=1e4 * scale * np.finfo(y.dtype).eps if scale else 0)
@@ -107,10 +112,60 @@ def test_triangular_systems(n, flags):
     assert_expanded(solve, a, matrix(n, 2) if left_side else matrix(2, n))
 
 
-def test_large_ones_are_left_to_lapack():
-    found = jit(lambda a: jnp.linalg.inv(a)).lower(np.eye(100))
-    assert found.compiler == "xla"
-    assert "of more than 32 rows or columns" in str(found)
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_large_ones_are_lapacks(dtype):
+    n = 40
+    a, b, s = matrix(n, n, dtype=dtype), matrix(n, 2, dtype=dtype), hermitian(n, dtype)
+    assert_expanded(lambda a: jax.lax.linalg.lu(a), a)
+    assert_expanded(lambda a, b: (jnp.linalg.solve(a, b), jnp.linalg.inv(a), jnp.linalg.slogdet(a)), a, b)
+    assert_expanded(lambda s, b: jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(s), True), b), s, b)
+    assert_expanded(lambda a: jax.lax.linalg.lu(a), matrix(50, 7, dtype=dtype))
+    assert_expanded(lambda a: jax.lax.linalg.lu(a), matrix(7, 50, dtype=dtype))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_large_ones_of_a_batch_and_in_stacks(dtype):
+    a, s = matrix(5, 40, 40, dtype=dtype), np.stack([hermitian(40, dtype) + k * np.eye(40) for k in range(5)])
+    all_of_them = lambda a, s: (jax.lax.linalg.lu(a), jnp.linalg.cholesky(s), jnp.linalg.solve(s, a))
+    assert_expanded(all_of_them, a, s)
+    assert_same(jax.vmap(jit(all_of_them))(a, s), jax.vmap(all_of_them)(a, s))
+
+
+@pytest.mark.parametrize("dtype", ["float64", "complex128"])
+@pytest.mark.parametrize("flags", list(itertools.product([False, True], repeat=5)))
+def test_large_triangular_systems(dtype, flags):
+    left_side, lower, transpose_a, conjugate_a, unit_diagonal = flags
+    n = 35
+    solve = lambda a, b: jax.lax.linalg.triangular_solve(
+        a,
+        b,
+        left_side=left_side,
+        lower=lower,
+        transpose_a=transpose_a,
+        conjugate_a=conjugate_a,
+        unit_diagonal=unit_diagonal,
+    )
+    a = matrix(n, n, dtype=dtype) / n + 2 * np.eye(n)
+    b = matrix(n, 2, dtype=dtype) if left_side else matrix(2, n, dtype=dtype)
+    assert_expanded(solve, a, b)
+    # By columns, as an LU is.
+    assert_expanded(lambda a, b: solve(jax.lax.linalg.lu(a)[0], b), a, b)
+
+
+def test_large_ones_that_are_singular():
+    n = 40
+    singular = np.tile(matrix(n, 1), (1, n))
+    assert_expanded(jax.lax.linalg.lu, np.zeros((n, n)))
+    assert_expanded(lambda a: jnp.isnan(jnp.linalg.cholesky(a)), -np.eye(n))
+    assert_expanded(lambda a: jnp.isnan(jnp.linalg.solve(a, np.full(n, np.nan))), singular)
+
+
+def test_large_ones_have_derivatives():
+    n = 40
+    a = matrix(n, n) + n * np.eye(n)
+    fn = lambda a: jnp.sum(jnp.sin(jnp.linalg.solve(a, jnp.ones(n))))
+    np.testing.assert_allclose(jax.grad(jit(fn))(a), jax.grad(fn)(a), rtol=1e-10, atol=1e-14)
+    np.testing.assert_allclose(jax.jvp(jit(fn), (a,), (a,))[1], jax.jvp(fn, (a,), (a,))[1], rtol=1e-10)
 
 
 NUMBERS = np.array([3.0, np.nan, -0.0, 0.0, np.inf, -np.inf, 1.0, 1.0, -2.5])

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..jaxprs.scalar_interpreter import Unsupported
 from .interface import VERSION
-from .target import Target, llvm
+from .target import SPLITTING, Target, llvm
 
 
 if TYPE_CHECKING:
@@ -56,6 +56,7 @@ def key(text: str, target: Target, optimise: bool) -> str:
         LONG,
         LOOPS,
         VERY_LONG,
+        SPLITTING,
         text,
     )
     return hashlib.sha256(repr(made).encode()).hexdigest()

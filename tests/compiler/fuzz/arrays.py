@@ -151,6 +151,26 @@ def product(name: str, dtype: str, draw: Draw) -> Operation:
     return Operation(name, lambda x, y: lax.dot_general(x, y, numbers), operands, smooth=dtype in FLOATS)
 
 
+@recipe("lu cholesky triangular_solve", (*FLOATS, *COMPLEX))
+def factorised(name: str, dtype: str, draw: Draw) -> Operation:
+    """Matrices that are too large to be written, far from singular; results are compared beside 8, as their errors are not in
+    proportion to each entry.
+    """
+    beside = lambda found: jax.tree.map(lambda x: x + 8, found)
+    n = 33 + draw.below(3)
+    x = Operand(dtype, (n, n), "plain")
+    regular = lambda x: 0.1 * x / (1 + jnp.max(jnp.abs(x))) + 3 * jnp.eye(n, dtype=dtype)
+    if name == "lu":
+        return Operation(name, lambda x: beside(lax.linalg.lu(regular(x))), (x,), 64)
+    if name == "cholesky":
+        return Operation(name, lambda x: beside(lax.linalg.cholesky(regular(x))), (x,), 64)
+    flags = ("left_side", "lower", "transpose_a", "conjugate_a", "unit_diagonal")
+    solve = functools.partial(lax.linalg.triangular_solve, **{flag: draw.chance(0.5) for flag in flags})
+    k = draw.one_of([1, 2])
+    b = Operand(dtype, (n, k) if solve.keywords["left_side"] else (k, n), "plain")
+    return Operation(name, lambda x, b: beside(solve(regular(x), b / (1 + jnp.max(jnp.abs(b))))), (x, b), 64)
+
+
 def _index(draw: Draw, n: int, shape: Any = ()) -> Operand:
     """Of a type that n is of: JAX counts from the end of an array in the type of the index."""
     dtypes = ["int32", "int64", "uint32", "uint64", "int16", "int8", "uint8"]

@@ -18,7 +18,7 @@ from ...types import DType, Equation
 from ..special_functions import by_simpler_ones
 from ..substitution import Substitution
 from ..unchecked import checks_dropped
-from .factorisations import cholesky, lu, lu_pivots_to_permutation
+from .factorisations import cholesky, is_by_lapack, lu, lu_pivots_to_permutation
 from .orthogonal import geqrf, householder_product, qr
 from .sorting import sort
 from .triangular import triangular_solve
@@ -64,6 +64,8 @@ def expanded(closed: ClosedJaxpr, checks: bool = True) -> ClosedJaxpr:
 
     def simpler(eqn: Equation) -> ClosedJaxpr | None:
         name = eqn.primitive.name
+        if is_by_lapack(eqn):
+            return None
         if name in EXPANSIONS:
             return by_simpler_ones(eqn, EXPANSIONS)
         if name == "one_kernel" and not eqn.params["lanes"]:

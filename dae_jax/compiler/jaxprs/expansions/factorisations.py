@@ -1,5 +1,6 @@
 """LU with partial pivoting, and Cholesky, of small matrices: written out, or in a loop over columns."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ...thresholds import THRESHOLDS
+from ...types import Equation
 from ..scalar_interpreter import Unsupported
 
 
@@ -17,6 +19,13 @@ def refuse_large(name: str, *sizes: int) -> None:
         raise Unsupported(f"{name} of an empty matrix")
     if max(sizes) > THRESHOLDS.largest_matrix:
         raise Unsupported(f"{name} of more than {THRESHOLDS.largest_matrix} rows or columns")
+
+
+def is_by_lapack(eqn: Equation) -> bool:
+    """Whether a factorisation is one of a matrix that is too large to be written, for which there is a rule."""
+    if eqn.primitive.name not in ("lu", "cholesky", "triangular_solve"):
+        return False
+    return max(eqn.invars[0].aval.shape[-2:]) > THRESHOLDS.largest_matrix and bool(eqn.outvars[0].aval.size)
 
 
 def of_batch(fn: Callable[..., Any], batch: int) -> Callable[..., Any]:
@@ -92,17 +101,18 @@ def _lu_in_loop(a: Array) -> tuple[Any, Any, Any]:
 
 def lu_pivots_to_permutation(pivots: Array, *, permutation_size: int, **_: object) -> Any:
     """The order of the rows after the exchanges."""
-    count = pivots.shape[-1]
 
     def permutation(pivots: Array) -> Any:
-        order = jnp.arange(permutation_size, dtype=jnp.int32)
-        for k in range(count):
-            j = pivots[k]
-            place = jnp.arange(permutation_size)
-            order = jnp.where(place == k, order[j], jnp.where(place == j, order[k], order))
-        return order
+        places, first = jnp.arange(permutation_size), jnp.arange(permutation_size, dtype=jnp.int32)
 
-    refuse_large("lu", permutation_size)
+        def exchanged(k: Array | int, order: Array) -> Array:
+            j = pivots[k]
+            return jnp.where(places == k, order[j], jnp.where(places == j, order[k], order))
+
+        if permutation_size > THRESHOLDS.largest_matrix:
+            return jax.lax.fori_loop(0, len(pivots), exchanged, first)
+        return functools.reduce(lambda order, k: exchanged(k, order), range(len(pivots)), first)
+
     return of_batch(permutation, pivots.ndim - 1)(pivots)
 
 

@@ -10,6 +10,7 @@ from . import (
     host as host,
     indexing as indexing,
     integers as integers,
+    lapack as lapack,
     loops as loops,
     movement as movement,
     reductions as reductions,

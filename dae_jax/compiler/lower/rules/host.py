@@ -1,5 +1,6 @@
 """The rule of functions on the host."""
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,12 +21,18 @@ def _may_raise(eqn: Equation) -> str | None:
     return "`pure_callback` of a function that may raise"
 
 
-def _addresses(eqn: Equation) -> int:
+def addresses(eqn: Equation) -> int:
+    """What is handed over."""
     return 2 * (len(eqn.invars) + len(eqn.outvars))
 
 
-@rule("pure_callback", ALL, requires=_may_raise, cost=_addresses, by_memory=True, on_host=True)
+@rule("pure_callback", ALL, requires=_may_raise, cost=addresses, by_memory=True, on_host=True)
 def pure_callback(context: Context, *args: Operand, callback: Any, **_: object) -> list[Any]:
+    """What a function of the user's gives."""
+    return on_host(context, callback, args)
+
+
+def on_host(context: Context, fn: Callable[..., Any], args: Sequence[Operand]) -> list[Any]:
     """What a function on the host gives, in the lanes that take part."""
     code, memory = context.code, context.memory
     ins = [_own_memory(context, x, k) for k, x in enumerate(args)]
@@ -39,7 +46,7 @@ def pure_callback(context: Context, *args: Operand, callback: Any, **_: object) 
             f"store ptr {x.buffer.pointer}, ptr {at}",
         ]
     function = code.function(HOST, "void", "i64", "i64", "ptr")
-    number = place(callback, [v.aval for v in context.eqn.invars], context.outs, code.width)
+    number = place(fn, [v.aval for v in context.eqn.invars], context.outs, code.width)
     code.lines.append(f"call void {function}(i64 {number}, i64 {_lanes(context)}, ptr {addresses})")
     return outs
 
