@@ -1,5 +1,5 @@
 """python -m tests.slow TIMES.xml: writes tests/slow.txt, the tests that take more than `LIMIT`, from what
-`pytest -n 2 --junitxml=TIMES.xml` has measured.
+`pytest -n 2 --junitxml=TIMES.xml` has measured; what was not run stays as it was.
 """
 
 import sys
@@ -28,8 +28,10 @@ def node(case: ElementTree.Element) -> str:
 
 
 def main(times: str) -> None:
-    cases = ElementTree.parse(times).getroot().iter("testcase")
-    found = {node(case) for case in cases if float(case.get("time", 0)) > LIMIT}
+    measured = {node(case): float(case.get("time", 0)) for case in ElementTree.parse(times).getroot().iter("testcase")}
+    found = {name for name, time in measured.items() if time > LIMIT} | (
+        set(SLOW.read_text().splitlines()) - measured.keys()
+    )
     slow = sorted(name for name in found if not name.startswith(ALWAYS))
     SLOW.write_text("".join(f"{name}\n" for name in slow))
     print(f"{len(slow)} slow tests in {SLOW.name}")

@@ -36,6 +36,10 @@ from .start import saved_parts
 from .trajectory_adjoint import Taped, as_it_is, can_be_taped, cotangents, recorded, saved_times
 
 
+FORWARD_ONLY = (
+    "With `adjoint=diffrax.ForwardMode()`, which a Lyapunov exponent is found with too, there are forward derivatives "
+    "only: `jax.jvp`, `jax.jacfwd`. For `jax.grad` leave `adjoint` out."
+)
 # How many problems stay compiled. Each holds 8 MB and more, most of it in JAX's caches of what it has traced.
 KEPT = 128
 _traced: list[Program] = []
@@ -72,6 +76,10 @@ def _numbers(program: Program, arrays: Arrays, steps: Steps | None = None) -> Sp
         return Split.of(call(solve, problem, None if steps is None else of_bits(steps)))
 
 
+def _refuse_reverse(*_: object) -> Any:
+    raise TypeError(FORWARD_ONLY)
+
+
 def run(program: Program, arrays: Arrays) -> tuple[DAESolution, Any, float]:
     """The solution of (`Solve`, `Problem`), whether the start was consistent and of the given rank, and the seconds spent on
     compiling this.
@@ -88,10 +96,7 @@ def run(program: Program, arrays: Arrays) -> tuple[DAESolution, Any, float]:
         raise
     except ValueError as error:
         if lacks_reverse_derivatives(error):
-            raise TypeError(
-                "With `adjoint=diffrax.ForwardMode()`, which a Lyapunov exponent is found with too, there are forward derivatives "
-                "only: `jax.jvp`, `jax.jacfwd`. For `jax.grad` leave `adjoint` out."
-            ) from error
+            raise TypeError(FORWARD_ONLY) from error
         raise
     finally:
         seconds = waiting.end()
@@ -125,7 +130,8 @@ class Solve:
         forward, _ = self.forwards().kernel(problem)
         pull_back = self._pull_back(problem)
         way = (lambda args, result: as_bits(result.numbers[-1])) if self.records_steps() else self._felt_steps(problem)
-        *fields, end, _ = one_kernel(numbers, self.derivative(), pull_back, forward, way)(arrays).whole()
+        kind = self.derivative() if way is None else "reverse"
+        *fields, end, _ = one_kernel(numbers, kind, pull_back, forward, way)(arrays).whole()
         check, check_arrays = self._check(problem, end)
         # A yes or no has no derivative.
         found = one_kernel(check, self.derivative())(jax.lax.stop_gradient(check_arrays))
@@ -196,6 +202,8 @@ class Solve:
 
     def _pull_back(self, problem: Problem) -> PullBack | None:
         """The reverse derivative from a tape, where it applies."""
+        if self.derivative() == "forward":
+            return _refuse_reverse
         size = sum(leaf.size for leaf in jax.tree.leaves(problem.y0))
         fixed_steps = isinstance(self.controller, diffrax.ConstantStepSize)
         if self.derivative() != "reverse" or not can_be_taped(self, size):
@@ -284,7 +292,8 @@ class Solve:
 
     def has_derivative_apart(self) -> bool:
         """Whether the derivative is a program of its own."""
-        return self.derivative() == "reverse" and one_kernel_enabled() and not self.recording
+        in_its_own_steps = self.derivative() == "any" or isinstance(self.adjoint, OneDirection)
+        return not in_its_own_steps and one_kernel_enabled() and not self.recording
 
     def records_steps(self) -> bool:
         """Whether the steps are written down for the derivative."""

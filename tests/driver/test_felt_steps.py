@@ -41,6 +41,15 @@ def moved(v: Any, solver: str, gravity: float = GRAVITY, **options: Any) -> Any:
     return sol.ys[0][-1, 0]
 
 
+@pytest.mark.parametrize("solver", ["projection", "RadauIIA5", "selected states", "BDF"])
+def test_in_forward_mode_only(solver: str) -> None:
+    """The same steps, whichever adjoint is asked for; with several directions at once, too."""
+    forward = lambda v: moved(v, solver, adjoint=diffrax.ForwardMode())
+    assert abs(jax.jacfwd(forward)(0.0) - EXACT) < ALLOWED[solver] * abs(EXACT)
+    both = jax.jacfwd(lambda x: moved(x[0], solver, GRAVITY + x[1], adjoint=diffrax.ForwardMode()))(jnp.zeros(2))
+    np.testing.assert_allclose(both, [EXACT, 0], atol=ALLOWED[solver] * abs(EXACT))
+
+
 @pytest.mark.parametrize("by", [jax.jacfwd, jax.grad], ids=["forwards", "reverse"])
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_about_an_equilibrium(solver: str, by: Any) -> None:
