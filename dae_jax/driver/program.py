@@ -242,12 +242,7 @@ class Solve:
         """
         adaptive = isinstance(self.controller, diffrax.AbstractAdaptiveStepSizeController)
         size = sum(leaf.size for leaf in jax.tree.leaves(problem.y0))
-        if (
-            not (adaptive and self.has_derivative_apart())
-            or self.event is not None
-            or self.max_steps is None
-            or size > LARGE
-        ):
+        if not (adaptive and self.has_derivative_apart()) or self.max_steps is None or size > LARGE:
             return None
         saveat = diffrax.SaveAt(subs=diffrax.SubSaveAt(t1=True, fn=as_it_is))
         program, _ = split((self, problem))

@@ -119,6 +119,7 @@ def _error(e5: Array, e3: Array, y0: Array, y1: Array) -> Any:
     # Relative to 1 + |y|, the scale of equal relative and absolute tolerances; only the ratio of the two counts.
     weights = 1 / (1 + jnp.maximum(jnp.abs(y0), jnp.abs(y1))) ** 2
     five, three = jnp.sum(weights * e5**2), jnp.sum(weights * e3**2)
-    ratio = five / (five + 0.01 * three + float(jnp.finfo(five.dtype).tiny))
-    # The derivative of the square root at 0 is infinite; that of an error of 0 is that of e₅.
-    return e5 * jnp.sqrt(jnp.where(ratio > 0, ratio, 1))
+    both = five + 0.01 * three
+    # The derivative of the ratio, and of the square root, at 0 is infinite; that of an error of 0 is that of e₅.
+    some = (five > 0) & (both > float(jnp.finfo(both.dtype).tiny) ** 0.5)
+    return e5 * jnp.sqrt(jnp.where(some, five, 1) / jnp.where(some, both, 1))

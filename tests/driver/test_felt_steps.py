@@ -50,6 +50,31 @@ def test_in_forward_mode_only(solver: str) -> None:
     np.testing.assert_allclose(both, [EXACT, 0], atol=ALLOWED[solver] * abs(EXACT))
 
 
+def never(t: Any, y: Any, args: Any, **_: Any) -> Any:
+    return y[0][0] - 5.0
+
+
+@pytest.mark.parametrize("by", [jax.jacfwd, jax.grad], ids=["forwards", "reverse"])
+@pytest.mark.parametrize(
+    "event", [diffrax.Event(never), D.Reset(never, lambda t, y, a: (y, a))], ids=["event", "reset"]
+)
+@pytest.mark.parametrize("solver", ["projection", "RadauIIA5"])
+def test_with_an_event(solver: str, event: Any, by: Any) -> None:
+    assert abs(by(lambda v: moved(v, solver, event=event))(0.0) - EXACT) < ALLOWED[solver] * abs(EXACT)
+
+
+def test_an_error_of_zero_has_a_derivative() -> None:
+    """At rest both of DOP853's estimates are 0, and so is what they are divided by."""
+    fixed = diffrax.ConstantStepSize()
+    found = jax.grad(
+        lambda v: D.daesolve(
+            PENDULUM, SOLVERS["projection"], 0.0, 5.0, 0.01, (jnp.array([0.0, -1.0]), jnp.stack([v, 0 * v])), GRAVITY,
+            stepsize_controller=fixed, event=diffrax.Event(never),
+        ).final[0][0]
+    )(0.0)  # fmt: skip
+    assert abs(found - EXACT) < 1e-9 * abs(EXACT)
+
+
 @pytest.mark.parametrize("by", [jax.jacfwd, jax.grad], ids=["forwards", "reverse"])
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_about_an_equilibrium(solver: str, by: Any) -> None:
