@@ -131,6 +131,19 @@ def test_large_ones_of_a_batch_and_in_stacks(dtype):
     assert_same(jax.vmap(jit(all_of_them))(a, s), jax.vmap(all_of_them)(a, s))
 
 
+def test_large_ones_in_the_lanes_that_ask_for_them():
+    """Lane k is solved k times, and what it has in other turns stays."""
+    n = 36
+    a = matrix(n, n) + n * np.eye(n)
+
+    def loop(turns, x):
+        solved = lambda k, x: jax.lax.cond(k < turns, lambda: n * jnp.linalg.solve(a + k * jnp.diag(x), x), lambda: x)
+        return jax.lax.fori_loop(0, 5, solved, x)
+
+    turns, x = np.arange(11) % 6, np.random.default_rng(0).uniform(1, 2, (11, n))
+    assert_same(jax.vmap(jit(loop))(turns, x), jnp.stack([loop(t, y) for t, y in zip(turns, x, strict=True)]))
+
+
 @pytest.mark.parametrize("dtype", ["float64", "complex128"])
 @pytest.mark.parametrize("flags", list(itertools.product([False, True], repeat=5)))
 def test_large_triangular_systems(dtype, flags):

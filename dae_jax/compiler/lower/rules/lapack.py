@@ -28,12 +28,12 @@ def lu(context: Context, a: Operand, **_: object) -> list[Any]:
     factorise = _native(context, "getrf")
     if factorise is None:
         return on_host(context, _lu, [a])
-    (m, n), memory = context.outs[0].shape, context.memory
-    columns = _own(context, _transposed(context.view(a)), 0)
-    pivots, outcome = memory.new(np.int32, context.outs[1].shape), memory.new(np.int32, ())
-    _call(context, factorise, m, n, columns, m, pivots, outcome)
-    exchanges = jax.make_jaxpr(functools.partial(_exchanges, rows=m))(context.outs[1])
-    return [_transposed(_joined(context, columns)), *context.run(exchanges, [pivots])]
+    (m, n), pivots = context.outs[0].shape, context.outs[1]
+    call = functools.partial(_call, context, factorise, m, n)
+    columns = _transposed(_numbers(context, a, 0))
+    found = _on_copies(context, [columns, pivots, _OUTCOME], lambda a, pivots, outcome: call(a, m, pivots, outcome))
+    exchanges = jax.make_jaxpr(functools.partial(_exchanges, rows=m))(pivots)
+    return [_transposed(_joined(context, found[0])), *context.run(exchanges, [found[1]])]
 
 
 @_factorisation("cholesky")
@@ -42,11 +42,12 @@ def cholesky(context: Context, a: Operand, **_: object) -> list[Any]:
     factorise = _native(context, "potrf")
     if factorise is None:
         return on_host(context, _cholesky, [a])
-    n, found, outcome = context.out.shape[0], _own(context, a, 0), context.memory.new(np.int32, ())
+    n = context.out.shape[0]
     # The lower half by rows is the upper one by columns, of the conjugate.
-    _call(context, factorise, "U", n, found, n, outcome)
+    call = functools.partial(_call, context, factorise, "U", n)
+    found, outcome = _on_copies(context, [_numbers(context, a, 0), _OUTCOME], lambda a, outcome: call(a, n, outcome))
     lower = jax.make_jaxpr(lambda a, failed: jnp.where(failed == 0, jnp.tril(a), jnp.nan))
-    return context.run(lower(context.out, jax.ShapeDtypeStruct((), np.int32)), [_joined(context, found), outcome])
+    return context.run(lower(context.out, _OUTCOME), [_joined(context, found), outcome])
 
 
 @_factorisation("triangular_solve")
@@ -57,11 +58,9 @@ def triangular_solve(context: Context, a: Operand, b: Operand, **options: Any) -
     solve = _native(context, "trsm")
     if solve is None:
         return on_host(context, of, [a, b])
-    view, is_complex = context.view(a), context.dtype.kind == "c"
-    by_columns = _transposed(view).contiguous and not is_complex
-    view = view if by_columns or (view.contiguous and not is_complex) else _own(context, view, 0, of.conjugate_a)
-    x = _own(context, b, 1)
     rows, columns = context.out.shape
+    matrix, right = _numbers(context, a, 0, of.conjugate_a), _numbers(context, b, 1)
+    by_columns = context.dtype.kind != "c" and _transposed(matrix).contiguous
     # In BLAS's eyes, which reads by columns, x and b are transposed, and so is a matrix that lies by rows.
     flags = (
         "R" if of.left_side else "L",
@@ -70,28 +69,37 @@ def triangular_solve(context: Context, a: Operand, b: Operand, **options: Any) -
         "U" if of.unit_diagonal else "N",
     )
     one = context.memory.constant_view(np.ones((), context.dtype))
-    _call(context, solve, *flags, columns, rows, one, view, view.shape[0], x, columns)
+    call = functools.partial(_call, context, solve, *flags, columns, rows, one)
+    n = matrix.shape[0]
+    if context.code.width == 1 and (by_columns or matrix.contiguous):
+        (x,) = _on_copies(context, [right], lambda x: call(matrix, n, x, columns))
+    else:
+        by_rows = _transposed(matrix) if by_columns else matrix
+        _, x = _on_copies(context, [by_rows, right], lambda a, x: call(a, n, x, columns))
     return [_joined(context, x)]
 
 
+# Whether a factorisation was possible.
+_OUTCOME: Any = jax.ShapeDtypeStruct((), np.int32)
+
+
 def _native(context: Context, name: str) -> str | None:
-    """The symbol of a function of LAPACK or BLAS for one matrix; `None` for stacks of them, and in lanes."""
-    alone = context.code.width == 1 and len(context.outs[0].shape) == 2
+    """The symbol of a function of LAPACK or BLAS for one matrix; `None` for stacks of them."""
     letter = {"float32": "s", "float64": "d", "complex64": "c", "complex128": "z"}[context.dtype.name]
-    return symbol(letter + name) if alone else None
+    return symbol(letter + name) if len(context.outs[0].shape) == 2 else None
 
 
-def _own(context: Context, x: Operand, k: int, conjugated: bool = False) -> View:
-    """Operand k, or what was made of it, in memory of its own, as LAPACK has numbers: imaginary parts beside their real ones."""
+def _numbers(context: Context, x: Operand, k: int, conjugated: bool = False) -> View:
+    """Operand k as LAPACK has numbers: imaginary parts beside their real ones, as a last axis."""
     if context.dtype.kind != "c":
-        return context.memory.copied(x, context.dtype)
+        return context.view(x, k)
     parts = jax.make_jaxpr(lambda x: jnp.stack([x.real, -x.imag if conjugated else x.imag], -1))
     (found,) = context.run(parts(jax.ShapeDtypeStruct(x.shape, context.dtype)), [context.view(x, k)])
-    return context.memory.copied(found, part(context.dtype))
+    return context.memory.view(found, part(context.dtype))
 
 
 def _joined(context: Context, x: View) -> Any:
-    """The matrix of what `_own` gave."""
+    """The matrix of what `_numbers` gives."""
     if context.dtype.kind != "c":
         return x
     whole = jax.make_jaxpr(lambda x: jax.lax.complex(x[..., 0], x[..., 1]))
@@ -100,7 +108,44 @@ def _joined(context: Context, x: View) -> Any:
 
 
 def _transposed(x: View) -> View:
-    return dataclasses.replace(x, shape=x.shape[::-1], strides=x.strides[::-1])
+    """With the first two axes exchanged."""
+    swap = lambda of: (of[1], of[0], *of[2:])
+    return dataclasses.replace(x, shape=swap(x.shape), strides=swap(x.strides))
+
+
+def _on_copies(context: Context, arrays: Sequence[Any], call: Callable[..., None]) -> list[View]:
+    """What `call` makes of copies of the arrays, in place, one lane after another; of what has a shape only it gets memory."""
+    code, memory = context.code, context.memory
+    fresh = lambda: [memory.new(x.dtype, x.shape) for x in arrays]
+    given = [memory.copied(x, x.dtype) if isinstance(x, View) and not isinstance(x.offset, int) else x for x in arrays]
+    found = fresh()
+    work = found if code.width == 1 else fresh()
+    for lane in range(code.width):
+        here = [_block(x, lane) if code.width > 1 else x for x in work]
+        for to, x in zip(here, given, strict=True):
+            if isinstance(x, View):
+                memory.assign(to, _lane(x, lane, code.width), fresh=True)
+        call(*here)
+        for to, x in zip(found if code.width > 1 else [], here, strict=False):
+            memory.assign(_lane(to, lane, code.width), x, fresh=True)
+    if code.width > 1:
+        memory.recycle([x.buffer for x in work])
+    return found
+
+
+def _lane(x: View, lane: int, width: int) -> View:
+    """The array of one lane, which lies between those of the others."""
+    if not x.buffer.lanes:
+        return x
+    of_lane = dataclasses.replace(x.buffer, lanes=False)
+    return dataclasses.replace(
+        x, buffer=of_lane, strides=tuple(width * s for s in x.strides), offset=width * x.offset + lane
+    )
+
+
+def _block(x: View, lane: int) -> View:
+    """A part of the memory of an array of all lanes that is as large as that of one."""
+    return dataclasses.replace(x, buffer=dataclasses.replace(x.buffer, lanes=False), offset=lane * max(x.size, 1))
 
 
 def _call(context: Context, name: str, *args: View | str | int) -> None:
