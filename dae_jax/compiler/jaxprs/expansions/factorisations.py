@@ -105,13 +105,17 @@ def lu_pivots_to_permutation(pivots: Array, *, permutation_size: int, **_: objec
     def permutation(pivots: Array) -> Any:
         places, first = jnp.arange(permutation_size), jnp.arange(permutation_size, dtype=jnp.int32)
 
-        def exchanged(k: Array | int, order: Array) -> Array:
+        def written(order: Array, k: int) -> Array:
             j = pivots[k]
             return jnp.where(places == k, order[j], jnp.where(places == j, order[k], order))
 
+        def in_place(k: Array | int, order: Array) -> Array:
+            j = pivots[k]
+            return order.at[k].set(order[j]).at[j].set(order[k])
+
         if permutation_size > THRESHOLDS.largest_matrix:
-            return jax.lax.fori_loop(0, len(pivots), exchanged, first)
-        return functools.reduce(lambda order, k: exchanged(k, order), range(len(pivots)), first)
+            return jax.lax.fori_loop(0, len(pivots), in_place, first)
+        return functools.reduce(written, range(len(pivots)), first)
 
     return of_batch(permutation, pivots.ndim - 1)(pivots)
 

@@ -8,9 +8,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Inexact, Int
+from jaxtyping import Inexact, Int
 
 from ...emit.lapack import symbol
+from ...jaxprs.expansions.factorisations import lu_pivots_to_permutation
 from ..access import address_of
 from ..arrays import Operand, View
 from ..context import Context
@@ -32,7 +33,8 @@ def lu(context: Context, a: Operand, **_: object) -> list[Any]:
     call = functools.partial(_call, context, factorise, m, n)
     columns = _transposed(_numbers(context, a, 0))
     found = _on_copies(context, [columns, pivots, _OUTCOME], lambda a, pivots, outcome: call(a, m, pivots, outcome))
-    exchanges = jax.make_jaxpr(functools.partial(_exchanges, rows=m))(pivots)
+    # LAPACK counts from 1.
+    exchanges = jax.make_jaxpr(lambda p: (p - 1, lu_pivots_to_permutation(p - 1, permutation_size=m)))(pivots)
     return [_transposed(_joined(context, found[0])), *context.run(exchanges, [found[1]])]
 
 
@@ -160,17 +162,6 @@ def _call(context: Context, name: str, *args: View | str | int) -> None:
         addresses.append(f"ptr {address_of(code, x.buffer, x.offset)}")
     function = code.function(name, "void", *["ptr"] * len(args))
     code.lines.append(f"call void {function}({', '.join(addresses)})")
-
-
-def _exchanges(pivots: Array, rows: int) -> tuple[Array, Array]:
-    """LAPACK's pivots counted from 0, and the order of the rows after the exchanges."""
-
-    def exchanged(k: Any, order: Array) -> Array:
-        j = pivots[k]
-        return order.at[k].set(order[j]).at[j].set(order[k])
-
-    pivots = pivots - 1
-    return pivots, jax.lax.fori_loop(0, len(pivots), exchanged, jnp.arange(rows, dtype=jnp.int32))
 
 
 def _of_each(*arrays: np.ndarray) -> Iterator[tuple[np.ndarray, ...]]:
