@@ -93,9 +93,10 @@ def multipliers(
 
 @at_ease
 def multipliers(system: ConstrainedSystem, *at: Any) -> Any:
-    """(λ, μ): the constraint forces are −Gᵀλ − Hᵀμ. Of least norm where constraints are redundant.
+    """λ, one entry a constraint, and μ, one a nonholonomic one, behind each other in one vector: the constraint forces are
+    −Gᵀλ − Hᵀμ. Of least norm where constraints are redundant.
 
-    `multipliers(system, sol)` gives them at each saved time, `multipliers(system, t, q, v, args)` at a point: any JAX
+    `multipliers(system, sol)` gives them at each saved time, a row each; `multipliers(system, t, q, v, args)` at a point: any JAX
     function, so that the condition of an event can use it; it costs one evaluation of the accelerations. Where constraints
     are redundant, the point form needs `ConstrainedSystem(..., rank=...)`.
 

@@ -1,5 +1,7 @@
 """What a solve gives back."""
 
+import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -69,8 +71,9 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
     times_outside = (
         "A time to save at (`saveat.ts`) lies outside of t0 to t1, if only by round-off: nothing is known there. Make t1 the last "
-        "of these times. Or they are not in the order in which the solve passes them."
+        "of these times. Or they are not in the order in which the solve passes them, or one is NaN."
     )
+    undefined_interval = "`t0` or `t1` is NaN or infinite: there is nothing to solve over."
     undefined_condition = (
         "The condition of an event is not a number (NaN) where the solve ended: an event there is not seen. Let it be defined "
         "on either side of its zero."
@@ -118,19 +121,46 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
 messages(RESULTS)[int(RESULTS.successful._value)] = "successful"
 
 
+@functools.partial(jax.tree_util.register_dataclass, data_fields=("numbers",), meta_fields=("rest",))
+@dataclasses.dataclass(frozen=True)
+class Split:
+    """What a jitted function returns: its arrays, and the rest."""
+
+    numbers: Any
+    rest: Any
+
+    @classmethod
+    def of(cls, tree: PyTree) -> "Split":
+        return cls(*eqx.partition(tree, eqx.is_array))
+
+    @classmethod
+    def to_return(cls, tree: PyTree) -> "Split":
+        """Of a part of a solution, which the user may return to `jit`: numpy's arrays have no hash."""
+        return cls(*eqx.partition(tree, lambda x: isinstance(x, jax.Array | np.ndarray | np.generic)))
+
+    def whole(self) -> Any:
+        """The two together."""
+        return eqx.combine(self.numbers, self.rest)
+
+
 class Interpolation(eqx.Module):
     """The solution at any time, in the user's structure, on the manifold where the method keeps its steps there."""
 
     path: diffrax.DenseInterpolation
-    decode: Callable[..., Any]
-    ode: Any
+    # `decode(t, y, ode)`, and its `ode`.
+    view: Split
+
+    @classmethod
+    def of(cls, path: diffrax.DenseInterpolation, decode: Callable[..., Any], ode: Any) -> "Interpolation":
+        return cls(path, Split.to_return((decode, ode)))
 
     @at_ease
     def evaluate(self, t0: Time, t1: Time | None = None, left: bool = True) -> Any:
         """The state at `t0`, or its increment from `t0` to `t1`."""
         if t1 is not None:
             return jax.tree.map(lambda a, b: b - a, self.evaluate(t0, left=left), self.evaluate(t1, left=left))
-        return self.decode(t0, self.path.evaluate(t0, left=left), self.ode)
+        decode, ode = self.view.whole()
+        return decode(t0, self.path.evaluate(t0, left=left), ode)
 
 
 class DAESolution(eqx.Module):
@@ -161,11 +191,18 @@ class DAESolution(eqx.Module):
     stats: dict[str, Any]
     result: Any
     event_mask: Any
-    args: Any = None
+    given: Any = eqx.field(
+        converter=lambda args: args if isinstance(args, Split) else Split.to_return(args), default=None
+    )
     rank: int | None = eqx.field(static=True, default=None)
     precision: str = eqx.field(static=True, default="")
     changed: Any = None
     end: Any = None
+
+    @property
+    def args(self) -> Any:
+        """As they were given to the solve."""
+        return self.given.whole()
 
     @property
     def final(self) -> Any:

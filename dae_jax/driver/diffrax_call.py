@@ -28,6 +28,7 @@ from ..solvers import (
 from ..types import Time, Y
 from .bracket import bracketing
 from .crossings import OneCrossing, OnStates
+from .event_functions import known_to_conditions
 from .felt_steps import SMALL, OneDirection, felt_steps
 from .followed_formulas import KnownFormulas
 from .followed_steps import RecordedEnds, Steps, at_steps, taken
@@ -75,15 +76,16 @@ def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[
     t0, t1, dt0, args = problem.t0, problem.t1, problem.dt0, problem.args
     y, ode = solve.encoded(problem)
     decode = Decode(solve.formulation, solve.solver)
-    solver, controller = economical(solve.solver, solve.between()), _fitted(solve.controller, t0, t1)
+    solver, controller = economical(solve.solver, solve.between()), _fitted(solve.controller)
     _refuse_other_tolerances(controller, y)
     felt = SMALL * jax.lax.stop_gradient(jnp.abs(t1 - t0)) if isinstance(solve.adjoint, OneDirection) else None
     if takes_residuals(solver):
-        solver, controller = _of_residuals(solver, controller)
+        solver = _with_tolerances_of(controller, solver)
         ode = dataclasses.replace(ode, felt=felt)
-        dt0 = first_step(ode.start, solver, t0, t1, y) if dt0 is None else dt0
+        chosen = dt0 is None and not isinstance(controller, diffrax.StepTo)
+        dt0 = first_step(ode.start, solver, t0, t1, y) if chosen else dt0
     else:
-        solver = _with_tolerances_within(solver, controller)
+        solver, controller = _with_tolerances_within(solver, controller), _with_smallest_step(controller, t0, t1)
 
     def saved(part: diffrax.SubSaveAt) -> Any:
         return part if part.fn is as_it_is else eqx.tree_at(lambda s: s.fn, part, View(part.fn, decode, args))
@@ -95,15 +97,11 @@ def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[
     saveat = eqx.tree_at(lambda s: s.subs, solve.saveat, subs, is_leaf=lambda x: x is None)
     event = cast(diffrax.Event | None, solve.event)
     if event is not None:
-        direction = jnp.where(t1 < t0, -1, 1)
-        given = {
-            "terms": solve.formulation.term(), "solver": solve.solver, "t0": t0, "t1": t1, "dt0": problem.dt0, "saveat": solve.saveat,
-            "stepsize_controller": solve.controller, "max_steps": solve.max_steps,
-        }  # fmt: skip
+        direction, given = jnp.where(t1 < t0, -1, 1), known_to_conditions(solve, problem)
         on_states = lambda c, up: OnStates(c, decode, args, direction, up, given)
         conditions = jax.tree.map(on_states, event.cond_fn, event.direction, is_leaf=lambda x: x is None or callable(x))
         event = dataclasses.replace(event, cond_fn=conditions, root_finder=bracketing(event.root_finder))
-    sums_errors = isinstance(controller, diffrax.ConstantStepSize) and not solve.recording
+    sums_errors = _may_ignore_errors(solve.controller) and not solve.recording
     observers: dict[str, Observer] = {"errors": SummedErrors()} if sums_errors else {}
     looped = _for_loops(solve, solver, y, _real(event, t0, y, ode), t0, t1)
     records = steps is None and (felt is not None or solve.records_steps())
@@ -134,7 +132,7 @@ def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[
     path = sol.interpolation
     if path is not None and isinstance(solver, AbstractManifoldSolver):
         path = solver.whole_path(path)
-    interpolation = None if path is None else Interpolation(path, decode, ode)
+    interpolation = None if path is None else Interpolation.of(path, decode, ode)
     ts, ys = cast(Any, sol.ts), cast(Any, sol.ys)
     end = jax.lax.stop_gradient(jax.tree.map(lambda x: x[-1], (ts["end"], ys["end"])))
     stats = {**sol.stats, "end_time": ts["end"][-1]}
@@ -172,18 +170,30 @@ def _for_loops(
     return TracedOnce(OneCrossing.of(solver, conditions, solve.formulation, t0, t1) if conditions else solver)
 
 
-def _fitted(controller: diffrax.AbstractStepSizeController, t0: Time, t1: Time) -> Any:
-    """The controller with a smallest step at the resolution of time, below which a solve cannot get on, and its default
-    norm without a library call.
+def _fitted(controller: diffrax.AbstractStepSizeController) -> Any:
+    """The controller with its default norm without a library call."""
+    if type(controller) is diffrax.PIDController and controller.norm is optimistix.rms_norm:
+        return dataclasses.replace(controller, norm=error_norm)
+    return controller
+
+
+def _with_smallest_step(controller: diffrax.AbstractStepSizeController, t0: Time, t1: Time) -> Any:
+    """The controller with a smallest step at the resolution of time, below which a solve cannot get on; a solver of residuals
+    finds by itself where that is.
     """
-    if type(controller) is not diffrax.PIDController:
-        return controller
-    if controller.norm is optimistix.rms_norm:
-        controller = dataclasses.replace(controller, norm=error_norm)
-    if controller.dtmin is not None:
+    if type(controller) is not diffrax.PIDController or controller.dtmin is not None:
         return controller
     floor = 16 * jnp.finfo(jnp.result_type(t0)).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
     return dataclasses.replace(controller, dtmin=floor, force_dtmin=False)
+
+
+def _may_ignore_errors(controller: Any) -> bool:
+    """Whether steps may go on whose error is above the tolerance: fixed ones, and those that a user's `dtmin` holds up."""
+    forced = getattr(controller, "dtmin", None) is not None and getattr(controller, "force_dtmin", False)
+    inner = getattr(controller, "controller", None)
+    return (
+        isinstance(controller, diffrax.ConstantStepSize) or forced or (inner is not None and _may_ignore_errors(inner))
+    )
 
 
 def _refuse_other_tolerances(controller: diffrax.AbstractStepSizeController, y: Y) -> None:
@@ -213,11 +223,9 @@ def _with_tolerances_within(solver: Any, controller: diffrax.AbstractStepSizeCon
     return dataclasses.replace(solver, solver=inner)
 
 
-def _of_residuals(solver: diffrax.AbstractSolver, controller: diffrax.AbstractStepSizeController) -> tuple[Any, Any]:
-    """A solver with the controller's tolerances; it finds by itself where time resolves no smaller step."""
+def _with_tolerances_of(controller: diffrax.AbstractStepSizeController, solver: diffrax.AbstractSolver) -> Any:
+    """A solver of residuals with the controller's tolerances where it has none."""
     if not isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
-        return solver, controller
+        return solver
     rtol, atol = (getattr(solver, name) or getattr(controller, name) for name in ("rtol", "atol"))
-    if type(controller) is diffrax.PIDController:
-        controller = dataclasses.replace(controller, dtmin=None)
-    return dataclasses.replace(solver, rtol=rtol, atol=atol), controller
+    return dataclasses.replace(cast(Any, solver), rtol=rtol, atol=atol)

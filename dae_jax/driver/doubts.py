@@ -38,7 +38,7 @@ _SENTENCES = {
     ),
     Doubt.UNRESOLVED: (
         "The fixed steps are too large: their errors, as the method estimates them, add up to more than the solution itself, as "
-        "they do beyond a method's limit of stability. Take smaller steps, or let them be chosen (`dt0=None`)."
+        "they do beyond a method's limit of stability. Take smaller steps, or let them be chosen (`dt0=None`, no `dtmin`)."
     ),
     Doubt.MANY_STEPS: (
         "A million steps and more were taken, and the errors that the tolerance allows in each of them may add up to more than a "
@@ -67,7 +67,7 @@ def found(
     passed: BoolLike,
     stepped_over: BoolLike,
 ) -> Int[Array, ""]:
-    """The doubts about a solve that went well, as bits; `errors`: of all fixed steps, as parts of the solution; `passed`:
+    """The doubts about a solve that went well, as bits; `errors`: of all steps that may be too large, as parts of the solution; `passed`:
     a configuration in which the constraints depend on each other; `stepped_over`: what switched in a step, with time, and back.
     """
     many = jnp.asarray(False)

@@ -1,6 +1,8 @@
 """Functions of events that cannot be called, or do not return what they must, are refused in a sentence."""
 
+import functools
 from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import diffrax
 import jax
@@ -12,18 +14,37 @@ from ..structure import dependence_patterns
 from ..types import Args, BoolLike, State, Time
 from ..validate.states import NUMBERS, brief, broadcast_to_state, describe
 from ..validate.user_functions import refuse_other_arguments, returned
+from .problem import Problem
 from .resets import Reset
 from .start import saved_parts
 
 
-def refuse_wrong_event(event: diffrax.Event | Reset | None, t: Time, y: State, args: Args) -> None:
-    """Refuses functions of an event that cannot be called with (t, y, args), or do not return what they must."""
+if TYPE_CHECKING:
+    from .program import Solve
+
+
+def known_to_conditions(solve: "Solve", problem: Problem) -> dict[str, Any]:
+    """The keyword arguments that diffrax gives the condition of an event."""
+    return {
+        "terms": solve.formulation.term(), "solver": solve.solver, "t0": problem.t0, "t1": problem.t1, "dt0": problem.dt0,
+        "saveat": solve.saveat, "stepsize_controller": solve.controller, "max_steps": solve.max_steps,
+    }  # fmt: skip
+
+
+def refuse_wrong_event(
+    event: diffrax.Event | Reset | None, t: Time, y: State, args: Args, known: dict[str, Any]
+) -> None:
+    """Refuses functions of an event that cannot be called with (t, y, args), those of an `Event` also with what is `known` to them by
+    name, or do not return what they must.
+    """
     if event is None:
         return
     conditions = [event.condition] if isinstance(event, Reset) else jax.tree.leaves(event.cond_fn, is_leaf=callable)
     for condition in conditions:
         # A boolean that stays true is no event of which there is one.
-        _refuse_wrong_condition(condition, t, y, args, "f" if isinstance(event, Reset) else "fb")
+        kinds, by_name = ("f", {}) if isinstance(event, Reset) else ("fb", known)
+        refuse_other_arguments("condition(t, y, args, **kwargs)", condition, 3, **known)
+        _refuse_wrong_condition(functools.partial(condition, **by_name) if by_name else condition, t, y, args, kinds)
     if isinstance(event, diffrax.Event) and isinstance(event.root_finder, optimistix.Bisection) and len(conditions) > 1:
         raise ValueError(
             "diffrax finds the first of several events by `optimistix.Newton`, not by bisection. For that give one condition: the product "
@@ -37,7 +58,6 @@ def refuse_wrong_event(event: diffrax.Event | Reset | None, t: Time, y: State, a
 def _refuse_wrong_condition(
     condition: Callable[..., Time | BoolLike], t: Time, y: State, args: Args, kinds: str
 ) -> None:
-    refuse_other_arguments("condition(t, y, args, **kwargs)", condition, 3, terms=None, solver=None, t0=None, t1=None)
     found = returned("condition(t, y, args, **kwargs)", condition, t, y, args)
     fits = isinstance(found, NUMBERS) and jnp.shape(found) == ()
     if not fits or np.dtype(jnp.result_type(found)).kind not in kinds:

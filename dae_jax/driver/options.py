@@ -38,6 +38,11 @@ def refuse_wrong_options(
     """Refuses options that are not what diffrax takes."""
     given = (saveat, controller, adjoint, event, progress_meter)
     _refuse_wrong_types(tuple(map(type, given)), given)
+    inside = [name for name in ("solver_state", "controller_state", "made_jump") if getattr(saveat, name)]
+    if inside:
+        raise ValueError(
+            f"`saveat` must not ask for {' and '.join(inside)}, which a solution does not keep: go on with `y0=sol.final`."
+        )
     if max_steps is not None and (type(max_steps) is not int or max_steps < 1):
         raise ValueError(
             f"`max_steps` must be an integer of at least 1, or None for no limit, but is {brief(max_steps)}."

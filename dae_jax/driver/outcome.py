@@ -70,6 +70,9 @@ def judged(
         ("inconsistent_start", "dependent_constraints", "irregular_mass", "ambiguous_start"), 1
     ):
         code = RESULTS.where(start == wrong, getattr(RESULTS, name), code)
+    # diffrax has no step to take where its comparisons with NaN are false.
+    defined = jnp.isfinite(problem.t0) & jnp.isfinite(problem.t1)
+    code = RESULTS.where(defined, code, RESULTS.undefined_interval)
     rank = count_of(problem.rank)
     went_well = (code == RESULTS.successful) | (code == RESULTS.event_occurred)
     stats = {
@@ -88,13 +91,13 @@ def _saved(saveat: diffrax.SaveAt, ts: PyTree[Array], ys: PyTree[Array]) -> list
 
 
 def _wrong_times(part: diffrax.SubSaveAt, problem: Problem) -> Bool[Array, " times"]:
-    """Which times to save at are beyond an end of the solve, which diffrax pads like a time that was not reached, or come after a
-    later one, to where it extrapolates.
+    """Which times to save at are beyond an end of the solve, which diffrax pads like a time that was not reached, come after a later
+    one, to where it extrapolates, or are NaN, at which it saves no more.
     """
     low, high = jnp.minimum(problem.t0, problem.t1), jnp.maximum(problem.t0, problem.t1)
     ts = jnp.asarray(part.ts)
     back = jnp.where(problem.t1 < problem.t0, -1, 1) * jnp.diff(ts, prepend=ts[:1]) < 0
-    return (ts < low) | (ts > high) | back
+    return ~((ts >= low) & (ts <= high)) | back
 
 
 def _times_only(saveat: diffrax.SaveAt) -> bool:

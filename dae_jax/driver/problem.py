@@ -4,7 +4,6 @@ import dataclasses
 import functools
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import PyTree
@@ -72,20 +71,3 @@ def split(tree: PyTree) -> tuple[Program, list[Any]]:
     arrays = [x for x in leaves if isinstance(x, jax.Array | np.ndarray | np.generic)]
     static = tuple(_ARRAY if isinstance(x, jax.Array | np.ndarray | np.generic) else x for x in leaves)
     return Program(treedef, static, tuple(map(type, static)), one_kernel_enabled()), arrays
-
-
-@functools.partial(jax.tree_util.register_dataclass, data_fields=("numbers",), meta_fields=("rest",))
-@dataclasses.dataclass(frozen=True)
-class Split:
-    """What a jitted function returns: its arrays, and the rest."""
-
-    numbers: Any
-    rest: Any
-
-    @classmethod
-    def of(cls, tree: PyTree) -> "Split":
-        return cls(*eqx.partition(tree, eqx.is_array))
-
-    def whole(self) -> Any:
-        """The two together."""
-        return eqx.combine(self.numbers, self.rest)

@@ -19,18 +19,18 @@ from ..equations.independent import independent
 from ..equations.regularity import COARSE
 from ..equations.residual_form import LARGE
 from ..formulations import AbstractFormulation
-from ..solution import DAESolution
+from ..solution import DAESolution, Split
 from ..solvers import AbstractManifoldSolver, economical, replays, takes_residuals
 from ..types import Scalar, State
 from ..validate.captured import settled
 from ..validate.user_functions import refuse_wrong_functions, returned
 from .diffrax_call import Decode, View, call
 from .ends import look
-from .event_functions import refuse_wrong_event
+from .event_functions import known_to_conditions, refuse_wrong_event
 from .felt_steps import OneDirection, by_felt_steps, some_change
 from .followed_steps import Steps, as_bits, of_bits
 from .outcome import judged
-from .problem import Problem, Program, Split, split
+from .problem import Problem, Program, split
 from .resets import Reset, solve_with_resets
 from .start import saved_parts
 from .trajectory_adjoint import Taped, as_it_is, can_be_taped, cotangents, recorded, saved_times
@@ -81,9 +81,7 @@ def _refuse_reverse(*_: object) -> Any:
 
 
 def run(program: Program, arrays: Arrays) -> tuple[DAESolution, Any, float]:
-    """The solution of (`Solve`, `Problem`), whether the start was consistent and of the given rank, and the seconds spent on
-    compiling this.
-    """
+    """The solution, whether the start was consistent and of the given rank, and the seconds spent on compiling."""
     _make_room()
     try:
         sol, as_expected = _jitted(program, arrays)
@@ -162,7 +160,7 @@ class Solve:
         self.formulation.refuse(system)
         if isinstance(self.solver, AbstractManifoldSolver):
             self.solver.refuse(system, self.formulation, *start)
-        refuse_wrong_event(self.event, *start)
+        refuse_wrong_event(self.event, *problem.start[1:], known_to_conditions(self, problem))
         for part in saved_parts(self.saveat):
             returned("saveat.fn(t, y, args)", part.fn, *start)
 
@@ -175,15 +173,16 @@ class Solve:
             tolerances = tuple(jnp.max(jnp.asarray(getattr(self.controller, name))) for name in ("rtol", "atol"))
         else:
             tolerances = (0.0, 0.0) if residual else (COARSE, COARSE)
-        program, arrays = split((*problem.start, end, tolerances, self.event))
+        known = {} if self.event is None else known_to_conditions(self, problem)
+        program, arrays = split((*problem.start, end, tolerances, self.event, known))
         invertible, rank, rows = self.formulation.inverts_mass, problem.rank, problem.rows
 
         def check(arrays: Arrays) -> Any:
-            system, t0, y0, args, end, tolerances, event = program.whole(arrays)
+            system, t0, y0, args, end, tolerances, event, known = program.whole(arrays)
             t, state = end
             conditions = [] if event is None else jax.tree.leaves(event.cond_fn, is_leaf=callable)
             finite = [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(state)]
-            defined = [~jnp.isnan(condition(t, state, args)) for condition in conditions]
+            defined = [~jnp.isnan(condition(t, state, args, **known)) for condition in conditions]
             numbers = (jnp.all(jnp.stack(finite)), jnp.all(jnp.asarray(defined, bool)))
             return *look(system, t0, y0, args, rank, rows, invertible, end, keeps, tolerances, residual), numbers
 

@@ -16,12 +16,12 @@ from .._compat import while_loop
 from ..compiler import one_kernel
 from ..compiler.types import Arrays
 from ..consistent import consistent_state
-from ..solution import RESULTS, DAESolution, precision_of
+from ..solution import RESULTS, DAESolution, Split, precision_of
 from ..systems import System
 from ..types import Args, Scalar, State, Time
 from ..validate.states import NUMBERS, brief
 from .bracket import Bracket
-from .problem import Problem, Split, count_of, split
+from .problem import Problem, count_of, split
 from .reset_levels import FromStart, level_at_start
 from .start import saved_parts
 
@@ -158,7 +158,7 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Any]:
         subs = {"wanted": dataclasses.replace(output, t0=False, t1=False, ts=later), "end": diffrax.SubSaveAt(t1=True)}
         one = dataclasses.replace(solve, event=event, saveat=diffrax.SaveAt(subs=subs))
         sol, _ = one(dataclasses.replace(problem, t0=p.t, y0=p.y, args=args))
-        return dataclasses.replace(sol, args=None), level
+        return dataclasses.replace(sol, given=None), level
 
     def advance(p: _Progress) -> _Progress:
         sol, level = part(p)

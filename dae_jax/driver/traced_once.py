@@ -7,9 +7,10 @@ import diffrax
 import jax
 
 from ..compiler.types import Arrays
+from ..solution import Split
 from ..solvers.wrapping import AbstractWrapper
 from ..types import BoolLike, Time
-from .problem import Program, Split, split
+from .problem import Program, split
 
 
 class TracedOnce(AbstractWrapper):

@@ -96,6 +96,7 @@ def cotangents(
     direction = jnp.where(taped.t1 < taped.t0, -1, 1)
     last = jnp.sum(jnp.isfinite(times)) - 1
     last_saved, end = _last_needed(direction, times, save_times, wanted, first)
+    end = jnp.minimum(end, last - 1)
 
     def saved(numbers: PyTree, t: Time, y: Y) -> Any:
         all_of = eqx.combine(numbers, rest)
@@ -198,9 +199,9 @@ def cotangents(
         lambda carry: carry[0] >= 0, one_step, carry
     )
     of_numbers = _sum(of_numbers, begins(of_begin)[0])
-    if part.t0:
+    if first or save_times.size:
         _, pull_back = jax.vjp(saved, numbers, taped.t0, taped.y)
-        more_numbers, more_t0, more_y = pull_back(_entry(wanted, 0))
+        more_numbers, more_t0, more_y = pull_back(_of_start(wanted, first, jnp.where(last > 0, 0, save_times.size)))
         of_numbers, of_t0, of_y = _sum(of_numbers, more_numbers), of_t0 + more_t0, _sum(of_y, more_y)
     of_numbers = of_numbers._replace(t0=of_numbers.t0 + of_t0, t1=of_numbers.t1 + of_t1, y=_sum(of_numbers.y, of_y))
     if part.ts is None:
@@ -234,6 +235,16 @@ def _last_needed(
     last_saved = jnp.max(jnp.where(counts, jnp.arange(save_times.size), -1))
     before = jnp.sum(jnp.isfinite(times) & (direction * (times - save_times[last_saved]) < 0)) - 1
     return last_saved, jnp.where(last_saved < 0, -1, jnp.maximum(before, 0))
+
+
+def _of_start(wanted: PyTree[Array], first: int, times: IntScalar) -> PyTree[Array]:
+    """The cotangent of the start: its own where it was saved, and those of so many `times`: all of them where there was no step."""
+
+    def total(rows: Array) -> Array:
+        counts = jnp.arange(rows.shape[0]) < first + times
+        return jnp.sum(jnp.where(counts.reshape(-1, *[1] * (rows.ndim - 1)), rows, 0), axis=0)
+
+    return jax.tree.map(total, wanted)
 
 
 def _is_zero(tree: PyTree[Array]) -> Any:

@@ -179,9 +179,9 @@ def _first_line(error: BaseException) -> str:
     return (str(error).strip().splitlines() or [""])[0].rstrip(".")
 
 
-def refuse_no_numbers(found: object, call: str) -> None:
+def refuse_no_numbers(found: object, call: str, like: State = None) -> None:
     """Refuses results that are not real floating-point numbers; integers have no derivative, booleans neither."""
-    for leaf in jax.tree.leaves(found, is_leaf=lambda x: x is None):
+    for leaf in _leaves(found, like):
         if not isinstance(leaf, NUMBERS):
             raise ValueError(f"`{call}` must return numbers, but returns {describe(found)}.")
         dtype = jnp.result_type(leaf)
@@ -197,6 +197,12 @@ def refuse_no_real_number(found: object, call: str) -> None:
         raise ValueError(f"`{call}` must return a real number, but returns {describe(found)}.")
 
 
+def _leaves(found: object, like: State) -> list[Any]:
+    """What there should be numbers of; `None` is none of it only where it is one in `like`."""
+    same = found is not None and jax.tree.structure(found) == jax.tree.structure(like)
+    return jax.tree.leaves(found, is_leaf=None if same else lambda x: x is None)
+
+
 def _shapes(tree: PyTree) -> tuple[Any, list[Any]]:
     leaves, structure = jax.tree.flatten(tree)
     return structure, [jnp.shape(x) for x in leaves]
@@ -209,7 +215,7 @@ def _count(tree: PyTree) -> int:
 def _like(found: object, call: str, like: State, name: str) -> None:
     """The structure and the shapes of `like`; for one vector, as many numbers in any other form."""
     # Numbers of other types are cast to those of the state.
-    for leaf in jax.tree.leaves(found, is_leaf=lambda x: x is None):
+    for leaf in _leaves(found, like):
         if not isinstance(leaf, NUMBERS) or jnp.issubdtype(jnp.result_type(leaf), jnp.complexfloating):
             raise ValueError(
                 f"`{call}` must return real numbers in the structure of {name}, but returns {describe(found)}."
@@ -222,7 +228,7 @@ def _like(found: object, call: str, like: State, name: str) -> None:
 
 
 def _as_many(found: object, call: str, like: State, name: str) -> None:
-    refuse_no_numbers(found, call)
+    refuse_no_numbers(found, call, like)
     if _count(found) != _count(like):
         raise ValueError(
             f"`{call}` must return as many equations as {name} has unknowns, {_count(like)}, but returns {_count(found)}: "

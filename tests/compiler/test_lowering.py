@@ -405,3 +405,19 @@ def test_what_our_compiler_stumbles_over_is_done_by_xla(monkeypatch):
     monkeypatch.setattr(kernel_call.lower, "compiled", fails)
     with pytest.warns(RuntimeWarning, match="unforeseen"):
         np.testing.assert_allclose(jax.jit(one_kernel(lambda x: x * 2, "forward"))(X), 2 * X)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_the_next_number_is_that_of_numpy(dtype):
+    """Also from and to the smallest numbers, which are zeros to the threads of XLA."""
+    tiny = np.finfo(dtype)
+    ends = [0.0, tiny.smallest_subnormal, 3 * tiny.smallest_subnormal, tiny.tiny, 1.0, tiny.max, np.inf]
+    values = np.array([sign * x for x in ends for sign in (1, -1)] + [np.nan], dtype)
+    x, y = map(np.ravel, np.meshgrid(values, values))
+    once = lambda at: jax.lax.fori_loop(0, 1, lambda i, z: jnp.nextafter(z, at[1]), at[0])
+    found = np.asarray(jax.jit(one_kernel(once))((x, y)))
+    with np.errstate(over="ignore", under="ignore"):
+        expected = np.nextafter(x, y)
+    np.testing.assert_array_equal(np.isnan(found), np.isnan(expected))
+    number, bits = ~np.isnan(expected), f"i{dtype().nbytes}"
+    np.testing.assert_array_equal(found[number].view(bits), expected[number].view(bits))

@@ -123,3 +123,21 @@ def test_what_was_saved_before_a_solve_failed_has_its_derivative(solver, directi
     assert code != dae_jax.RESULTS.successful._value
     at = np.array(times[:2])
     np.testing.assert_allclose(slope, -(at * np.exp(-2 * at)).sum(), rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["Tsit5", "projection", "bdf"])
+@pytest.mark.parametrize("saved", [dict(), dict(t0=True), dict(t1=True)], ids=str)
+def test_of_an_interval_without_length(name, saved):
+    """Where no step is taken, all that is saved is the start; the derivatives by times are 0."""
+
+    def loss(angle, t0, t1, ts):
+        y0 = (jnp.stack([jnp.sin(angle), jnp.cos(angle)]), jnp.stack([jnp.cos(angle), -jnp.sin(angle)]))
+        saveat = diffrax.SaveAt(ts=ts, **saved)
+        (q, _) = dae_jax.daesolve(SCENE.system, SOLVERS[name], t0, t1, None, y0, saveat=saveat).ys
+        return jnp.sum(jnp.arange(1.0, 1 + len(q)) @ q)
+
+    of_angle, *of_times = jax.grad(loss, argnums=(0, 1, 2, 3))(0.3, 1.0, 1.0, jnp.ones(2))
+    rows = 2 + len(saved)
+    np.testing.assert_allclose(of_angle, rows * (rows + 1) / 2 * (np.cos(0.3) - np.sin(0.3)), rtol=1e-13)
+    for found in of_times:
+        np.testing.assert_array_equal(found, 0)

@@ -2,6 +2,7 @@
 # A row of the table is a line.
 # ruff: noqa: E501
 
+import dataclasses
 import math
 import re
 import time
@@ -10,6 +11,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix
 import pytest
 
 import dae_jax as D
@@ -202,6 +204,7 @@ METHODS = {
     "saveat of None": (given(saveat=None), "`saveat` must be a diffrax.SaveAt such as diffrax.SaveAt(ts=jnp.linspace(t0, t1, 101)), but is None."),
     "saveat with NaN": (given(saveat=diffrax.SaveAt(ts=np.array([0.0, np.nan]))), "`saveat.ts` must be a vector of finite times"),
     "saveat with a matrix": (given(saveat=diffrax.SaveAt(ts=np.zeros((2, 2)))), "`saveat.ts` must be a vector of finite times"),
+    "saveat of what is inside": (given(saveat=diffrax.SaveAt(t1=True, solver_state=True, made_jump=True)), "`saveat` must not ask for solver_state and made_jump, which a solution does not keep: go on with `y0=sol.final`."),
     "adjoint a class": (given(adjoint=diffrax.ForwardMode), "`adjoint` must be a diffrax adjoint such as diffrax.ForwardMode(), but is the class ForwardMode"),
     "adjoint in words": (given(adjoint="forward"), "`adjoint` must be a diffrax adjoint such as diffrax.ForwardMode(), but is 'forward'."),
     "backsolve": (given(adjoint=diffrax.BacksolveAdjoint()), "`adjoint` must not be BacksolveAdjoint, which knows nothing of the constraints: use the default, RecursiveCheckpointAdjoint(), for reverse mode, and ForwardMode() for forward mode."),
@@ -217,6 +220,8 @@ EVENTS = {
     "a function": (given(event=level), "`event` must be a diffrax.Event(condition), which ends the solve, or a dae_jax.Reset(condition, reset), after which it goes on, but is the function level."),
     "a class": (given(event=D.Reset), "but is the class Reset: write Reset(...)."),
     "Event without keywords": (event(lambda t, y, a: y[0][0]), "`condition(t, y, args, **kwargs)` must take these arguments, but the function given takes (t, y, a)"),
+    "Event with other keywords": (event(lambda t, y, a, *, other, **k: y[0][0]), "`condition(t, y, args, **kwargs)` must take these arguments"),
+    "Event of diffrax's terms": (event(diffrax.steady_state_event(1e-3, 1e-3)), "`condition(t, y, args, **kwargs)` fails with"),
     "Event of a vector": (event(lambda t, y, a, **k: y[0]), "`condition(t, y, args, **kwargs)` must return a real number, whose zero is the event, but returns float64[2]."),
     "Event of an integer": (event(lambda t, y, a, **k: 1), "must return a real number, whose zero is the event, but returns int64[]."),
     "root finder in words": (lambda: solve(event=diffrax.Event(level, "newton")), "`root_finder` of diffrax.Event must be a root finder such as optimistix.Newton(1e-8, 1e-8), but is 'newton'."),
@@ -308,3 +313,42 @@ def test_what_is_no_mistake_is_taken():
     np.testing.assert_allclose(sol.final[0], solve().final[0], atol=1e-12)
     sol = solve(DECAY, TSIT5, jnp.ones(2), formulation=D.Baumgarte(1.0, 1.0))
     np.testing.assert_allclose(sol.final, np.exp(-1) * np.ones(2), atol=1e-7)
+
+
+def test_what_diffrax_takes_is_taken():
+    """Empty places in a state, the names that a condition is given, steps at times that are given."""
+    decay = D.ImplicitDAE(lambda t, y, yd, args: {"x": yd["x"] + y["x"], "none": None})
+    start = {"x": jnp.ones(1), "none": None}
+    for solver in (TSIT5, RADAU):
+        assert solve(decay, solver, start).final["none"] is None
+        np.testing.assert_allclose(solve(decay, solver, start).final["x"], np.exp(-1), atol=1e-7)
+    mapped = D.ConstrainedSystem(
+        lambda t, q, v, args: {"x": jnp.array([0.0, -9.81]), "none": None},
+        lambda t, q, args: constraint(t, q["x"], args),
+    )
+    sol = solve(mapped, y0=({"x": Q0, "none": None}, {"x": V0, "none": None}))
+    np.testing.assert_allclose(sol.final[0]["x"], solve().final[0], atol=1e-12)
+    half = lambda t, y, args, *, terms, solver, t0, t1, dt0, saveat, stepsize_controller, max_steps: t - (t0 + t1) / 2
+    np.testing.assert_allclose(solve(event=diffrax.Event(half, optimistix.Newton(1e-8, 1e-8))).ts[-1], 0.5, atol=1e-6)
+    times = diffrax.StepTo(jnp.linspace(0.0, 1.0, 101))
+    for solver in (TSIT5, RADAU, D.BDF()):
+        sol = solve(DECAY, solver, jnp.ones(2), stepsize_controller=times)
+        assert sol.stats["num_steps"] == 100
+        np.testing.assert_allclose(sol.final, np.exp(-1), rtol=2e-3)
+
+
+@pytest.mark.parametrize("solver", [RADAU, D.Radau(), D.BDF(), TSIT5], ids=lambda s: type(s).__name__)
+def test_the_smallest_step_is_that_of_the_controller(solver):
+    """Else `dtmin` would be of no effect."""
+    smallest = diffrax.PIDController(1e-8, 1e-8, dtmin=0.2)
+    assert solve(DECAY, solver, jnp.ones(2), stepsize_controller=smallest).stats["num_steps"] < 8
+    with pytest.raises(RuntimeError):
+        solve(DECAY, solver, jnp.ones(2), stepsize_controller=dataclasses.replace(smallest, force_dtmin=False))
+
+
+@pytest.mark.parametrize("t0", [2e8, -1e9])
+@pytest.mark.parametrize("solver", [RADAU, D.Radau(), D.BDF()], ids=lambda s: type(s).__name__)
+def test_time_may_begin_late(solver, t0):
+    """The first step is one that time resolves there."""
+    sol = D.daesolve(DECAY, solver, t0, t0 + 1.0, None, jnp.ones(2))
+    np.testing.assert_allclose(sol.final, np.exp(-1), rtol=1e-6)

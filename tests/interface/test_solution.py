@@ -65,3 +65,32 @@ def test_a_solution_can_be_copied(way):
     np.testing.assert_array_equal(
         dae_jax.drift(SCENE.system, again).position, dae_jax.drift(SCENE.system, sol).position
     )
+
+
+TO_RETURN = {
+    "projection": (PROJECTED, None),
+    "tangent space": (dae_jax.TangentSpace(diffrax.Tsit5()), None),
+    "dummy derivatives": (diffrax.Tsit5(), dae_jax.DummyDerivatives()),
+    "BDF": (dae_jax.BDF(), None),
+}
+
+
+@pytest.mark.parametrize("name", TO_RETURN)
+def test_dense_output_may_be_returned_to_jit_and_vmap_and_handed_to_them(name):
+    """With functions in it: those of the system, and one in `args`."""
+    solver, formulation = TO_RETURN[name]
+    system = dae_jax.ConstrainedSystem(lambda t, q, v, args: args[0](args[1]), SCENE.system.constraint)
+    force = lambda g: jnp.stack([0 * g, g])
+
+    def solve(g):
+        return dae_jax.daesolve(
+            system, solver, 0.0, 1.0, None, SCENE.y0, (force, g), formulation=formulation,
+            saveat=diffrax.SaveAt(dense=True),
+        )  # fmt: skip
+
+    expected = solve(9.81).evaluate(0.5)[0]
+    one, both = jax.jit(solve)(9.81), jax.vmap(solve)(jnp.array([9.81, 3.0]))
+    np.testing.assert_array_equal(one.args[0](2.0), force(2.0))
+    at = jax.jit(lambda sol, t: sol.evaluate(t)[0])
+    np.testing.assert_allclose(at(one, 0.5), expected, atol=1e-14)
+    np.testing.assert_allclose(jax.vmap(lambda sol: sol.evaluate(0.5)[0])(both)[0], expected, atol=1e-7)

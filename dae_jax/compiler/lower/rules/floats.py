@@ -88,18 +88,20 @@ def is_finite(context: Context, x: Number, **_: object) -> Value:
 
 @entrywise("nextafter", FLOATS)
 def nextafter(context: Context, x: Number, y: Number, **_: object) -> Any:
-    """The next number from x towards y."""
+    """The next number from x towards y. Compared as integers, where the smallest numbers are no zeros as they are to XLA's threads."""
     code, kind = context.code, kind_of(context.dtype)
-    integer = f"i{8 * BYTES[kind]}"
+    bits = 8 * BYTES[kind]
+    integer = f"i{bits}"
     x, y = (code.copy(z, kind) for z in (x, y))
-    bits = code.cast("bitcast", x, integer)
-    away = code.op("xor", "i1", *(code.op("fcmp olt", kind, a, b, result="i1") for a, b in ((x, y), (0.0, x))))
-    step = code.select(away, -1, 1, integer)
-    moved = code.cast("bitcast", code.op("add", integer, bits, step), kind)
-    least = code.cast("bitcast", Value("1", integer), kind)
-    moved = code.select(
-        code.op("fcmp oeq", kind, x, 0.0, result="i1"), code.intrinsic("copysign", kind, least, y), moved, kind
-    )
-    same = code.op("fcmp oeq", kind, x, y, result="i1")
+    of_x, of_y = (code.cast("bitcast", z, integer) for z in (x, y))
+    below = lambda a, b: code.op("icmp slt", integer, a, b, result="i1")
+    # The order of the numbers: of negative ones, and of −0, it is the other way round.
+    place = lambda z: code.select(below(z, 0), code.op("sub", integer, -(2 ** (bits - 1)), z), z, integer)
+    a, b = place(of_x), place(of_y)
+    step = code.select(code.op("xor", "i1", below(a, b), below(of_x, 0)), 1, -1, integer)
+    from_zero = code.select(below(a, b), 1, 1 - 2 ** (bits - 1), integer)
+    is_zero, same = (code.op("icmp eq", integer, a, z, result="i1") for z in (0, b))
+    moved = code.select(is_zero, from_zero, code.op("add", integer, of_x, step), integer)
+    moved = code.cast("bitcast", moved, kind)
     undefined = code.op("fcmp uno", kind, x, y, result="i1")
     return code.select(undefined, code.op("fadd", kind, x, y), code.select(same, y, moved, kind), kind)
