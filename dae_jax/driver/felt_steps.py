@@ -7,20 +7,26 @@ derivative's own, relative to its size.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, PyTree
 
 from ..compiler import equations
 from ..equations.consistent_change import consistent_change
 from ..solvers import felt
 from ..systems import is_mechanism
-from ..types import Scalar, State, Time, Y
+from ..types import Scalar, Time, Y
 from .observed_steps import AbstractStepsOf
 from .problem import Problem
+
+
+if TYPE_CHECKING:
+    from .program import Solve
 
 
 # In parts of the solve, steps in which round-off of a derivative, over the step, is no reason for smaller ones.
@@ -31,29 +37,54 @@ class OneDirection(diffrax.ForwardMode):
     """Forward derivatives along one direction, by steps that are short enough for it: those of the solution are the same."""
 
 
-def some_change(problem: Problem, consistent: bool) -> State:
-    """A change of all of a start, by no pattern, which stays `consistent` where this is asked for; 0 where no such is found, as with a
-    resistor of 0 Ω: then steps are those of the solution.
+def changing(solve: "Solve", problem: Problem) -> tuple[Any, Any]:
+    """What a derivative may be by, the inexact arrays in (formulation, system, args) and the start, and all else of these."""
+    return eqx.partition(((solve.formulation, problem.system, problem.args), problem.y0), eqx.is_inexact_array)
+
+
+def with_changes(solve: "Solve", problem: Problem, given: Any) -> tuple["Solve", Problem]:
+    """The same with others of what is `changing`."""
+    (formulation, system, args), y0 = given
+    return (
+        dataclasses.replace(solve, formulation=formulation),
+        dataclasses.replace(problem, system=system, args=args, y0=y0),
+    )
+
+
+def some_change(solve: "Solve", problem: Problem, consistent: bool) -> Any:
+    """A change of all that is `changing`, by no pattern: all of a parameter that is not 0. The start stays `consistent` where this is asked
+    for; nothing changes where no such is found, as with a resistor of 0 Ω: then steps are those of the solution.
     """
-    system, t0, y0, args = problem.start
-    numbers, tree = ravel_pytree(y0)
-    change = tree((1 + jnp.abs(numbers)) * jnp.cos(1 + jnp.arange(numbers.size, dtype=numbers.dtype) ** 2))
+    (parameters, start), _ = changing(solve, problem)
+    of_parameters = _by_no_pattern(parameters, lambda x: jnp.where(x == 0, 1, jnp.abs(x)))
+    change = _by_no_pattern(start, lambda x: 1 + jnp.abs(x))
     if not consistent:
-        return change
+        return of_parameters, change
+    system, t0, y0, args = problem.start
     # In any metric, where a mass may be 0.
-    metric: Any = dataclasses.replace(system, mass=None) if is_mechanism(system) else system
-    change = consistent_change(metric, t0, y0, change, args)
+    metric = lambda x: dataclasses.replace(x, mass=None) if is_mechanism(system) else x
+    change = consistent_change(metric(system), t0, y0, change, args, (metric(of_parameters[1]), of_parameters[2]))
     found = jnp.all(jnp.isfinite(ravel_pytree(change)[0]))
-    return jax.tree.map(lambda x: jnp.where(found, x, 0), change)
+    return jax.tree.map(lambda x: jnp.where(found, x, 0), (of_parameters, change))
 
 
-def by_felt_steps(solved: Callable[[State], Any], y0: State, change: State) -> Any:
-    """What a solve with `felt_steps` gives for a start, by steps that are short enough for what a change of it grows into. Where a
-    function of the user has a derivative in reverse only, a rule of its own, they are those of the solution.
+def _by_no_pattern(tree: PyTree[Array], sizes: Callable[[Array], Array]) -> Any:
+    numbers, unflatten = ravel_pytree(tree)
+    return unflatten(sizes(numbers) * jnp.cos(1 + jnp.arange(numbers.size, dtype=numbers.dtype) ** 2))
+
+
+def by_felt_steps(solved: Callable[[Any], Any], given: Any, change: Any) -> Any:
+    """What a solve with `felt_steps` gives for what is `changing`, by steps that are short enough for what a change of it grows into.
+    Where a function of the user has a derivative in reverse only, a rule of its own, they are those of the solution; where it has none by
+    parameters, a call of Python say, they are short enough for what a change of the start grows into.
     """
-    if any(eqn.primitive.name.startswith("custom_vjp") for eqn in equations(jax.make_jaxpr(solved)(y0))):
-        return solved(y0)
-    return jax.jvp(solved, (y0,), (change,))[0]
+    if any(eqn.primitive.name.startswith("custom_vjp") for eqn in equations(jax.make_jaxpr(solved)(given))):
+        return solved(given)
+    try:
+        return jax.jvp(solved, (given,), (change,))[0]
+    except (NotImplementedError, ValueError, TypeError):
+        (parameters, start), (_, of_start) = given, change
+        return jax.jvp(lambda start: solved((parameters, start)), (start,), (of_start,))[0]
 
 
 def felt_steps(controller: diffrax.AbstractAdaptiveStepSizeController, smallest: Scalar) -> Any:

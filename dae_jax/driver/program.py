@@ -27,7 +27,7 @@ from ..validate.user_functions import refuse_wrong_functions, returned
 from .diffrax_call import Decode, View, call
 from .ends import look
 from .event_functions import known_to_conditions, refuse_wrong_event
-from .felt_steps import OneDirection, by_felt_steps, some_change
+from .felt_steps import OneDirection, by_felt_steps, changing, some_change, with_changes
 from .followed_steps import Steps, as_bits, of_bits
 from .outcome import judged
 from .problem import Problem, Program, split
@@ -246,17 +246,17 @@ class Solve:
         saveat = diffrax.SaveAt(subs=diffrax.SubSaveAt(t1=True, fn=as_it_is))
         program, _ = split((self, problem))
 
-        def steps(arrays: Arrays, change: State) -> Steps:
+        def steps(arrays: Arrays, change: Any) -> Steps:
             with settled(program.leaves):
                 solve, problem = program.whole(arrays)
                 solve = dataclasses.replace(solve, adjoint=OneDirection(), saveat=saveat)
-                solved = lambda y0: call(solve, dataclasses.replace(problem, y0=y0))[-1]
-                return as_bits(by_felt_steps(solved, problem.y0, change))
+                given, rest = changing(solve, problem)
+                solved = lambda given: call(*with_changes(solve, problem, eqx.combine(given, rest)))[-1]
+                return as_bits(by_felt_steps(solved, given, change))
 
         def way(args: tuple[Arrays], _: Split) -> Steps:
             (arrays,) = jax.lax.stop_gradient(args)
-            _, problem = program.whole(arrays)
-            return as_kernel(steps)(arrays, some_change(problem, takes_residuals(self.solver)))
+            return as_kernel(steps)(arrays, some_change(*program.whole(arrays), takes_residuals(self.solver)))
 
         return way
 
