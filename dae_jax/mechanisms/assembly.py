@@ -105,8 +105,8 @@ def _start(mechanism: "Mechanism", guess: Any) -> tuple[Coordinates, Coordinates
     found = []
     for what, found_so_far, part in zip(("positions", "velocities"), (q, v), given, strict=True):
         if isinstance(part, Coordinates):
-            found.append(part)
-            continue
+            # Of another mechanism with the same bodies the order may be another.
+            part = {name: part[name] for name in part.names}
         for name, value in part.items():
             row, known = numbers(value), found_so_far.names
             if name not in known:

@@ -67,11 +67,8 @@ class Mechanism(eqx.Module):
 
     def configuration(self, q: Coordinates, v: Coordinates | None = None) -> Configuration:
         """All bodies at one instant."""
-        if not isinstance(q, Coordinates):
-            raise TypeError(
-                f"A state of a Mechanism is a pair of `Coordinates`, as `assemble` gives it and takes it from a guess by name, but "
-                f"is {brief(q)}."
-            )
+        for part in (q,) if v is None else (q, v):
+            _refuse_other_states(self, part)
         return Configuration(self.bodies, q, v)
 
     # The equations
@@ -252,6 +249,21 @@ class Mechanism(eqx.Module):
         is the derivative of `energy`.
         """
         return outputs.power(self, sol)
+
+
+def _refuse_other_states(mechanism: Mechanism, part: Coordinates) -> None:
+    """Refuses what is no part of this mechanism's states: rows go with bodies by their order."""
+    if not isinstance(part, Coordinates):
+        raise TypeError(
+            f"A state of a Mechanism is a pair of `Coordinates`, as `assemble` gives it and takes it from a guess by name, but "
+            f"is {brief(part)}."
+        )
+    names = tuple(body.name for body in mechanism.bodies)
+    if part.names != names:
+        raise ValueError(
+            f"A state of this Mechanism has the bodies {', '.join(names)}, in this order, but this one is of another mechanism, with "
+            f"{', '.join(part.names)}: `assemble` takes it as a guess."
+        )
 
 
 def _refuse_what_does_not_fit(mechanism: Mechanism, given: Sequence[AbstractJoint | AbstractLoad]) -> None:
