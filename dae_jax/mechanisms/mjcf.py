@@ -136,11 +136,12 @@ class _Reader:
             self.unsupported.append("a fluid around the bodies (density, viscosity)")
 
     def _refuse_field(self, kind: str, field: str) -> None:
-        """What is set (0 and −1 are nothing) of a field that is not known."""
+        """What is set of a field that is not known: 0 is nothing, and of whole numbers, which are ids, −1."""
         rows = np.asarray(getattr(self.model, field))
         if rows.ndim == 0 or (field == "dof_frictionloss" and self._disabled("FRICTIONLOSS", "CONSTRAINT")):
             return
-        owners = np.flatnonzero(((rows != 0) & (rows != -1)).any(tuple(range(1, rows.ndim))))
+        nothing = (0, -1) if np.issubdtype(rows.dtype, np.integer) else (0,)
+        owners = np.flatnonzero((~np.isin(rows, nothing)).any(tuple(range(1, rows.ndim))))
         if kind == "dof":
             owners = np.unique(self.model.dof_jntid[owners])
         for k in owners:

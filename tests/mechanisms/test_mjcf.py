@@ -177,6 +177,7 @@ def test_constraints_that_are_switched_off_are():
     [
         ("<joint ", 'springyield="5" ', "springyield of joint 'g'"),
         ("<joint ", 'armature="1" ', "armature of joint 'g'"),
+        ("<joint ", 'frictionloss="-1" ', "frictionloss of joint 'g'"),
         ('name="b" ', 'gravcomp="1" ', "gravcomp of body 'b'"),
     ],
 )
