@@ -127,17 +127,11 @@ class Coupling(AbstractHolonomicJoint):
     """Two coordinates that go together, c₁ = Σ aₖ c₂ᵏ: a gear, a rack, a screw. Whole turns of an angle c₁ in space do not count."""
 
     name: str = eqx.field(static=True)
+    on_a: Marker
+    on_b: Marker
     first: Coordinate
     second: Coordinate | None
     coefficients: Float[Array, " k"]
-
-    @property
-    def on_a(self) -> Marker:
-        return self.first.on_a
-
-    @property
-    def on_b(self) -> Marker:
-        return self.first.on_b
 
     def constraint(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
         other = jnp.zeros(()) if self.second is None else self.second(at)
@@ -159,13 +153,16 @@ def coupling(
 
     **Arguments**
 
-    - `first`, `second`: joints with one coordinate, or their coordinates.
+    - `first`, `second`: joints with one coordinate, or their coordinates. `Mechanism.reaction` is that on the second body of `first`
+      (where that is the ground, the opposite of that on its first body).
     - `coefficients`: (a₀, a₁, ...): (0, −2) is a gear of ratio 2 that turns the other way.
 
     Errors: `ValueError` for an angle in space that would have to count its turns, which are not known there: c₂ may be one where
     the coupling is linear and either c₁ is none, or a₁ or 1/a₁ is a whole number.
     """
     one, two = only_coordinate(first), None if second is None else only_coordinate(second)
+    # Whichever coordinate the equation is solved for, the reaction is that on the body of the first.
+    on_a, on_b = one.on_a, one.on_b
     label, a = f"coupling of {one.name}" if name is None else name, numbers(coefficients)
     # Of what is known, `atleast_1d` is known no more in `jit`.
     a = _without_zeros(a if a.ndim else a[None])
@@ -181,8 +178,7 @@ def coupling(
         if not (one.is_turn and follows):
             # c₂ = (c₁ − a₀)/a₁ is the same, and smooth whatever turns c₂ has made.
             one, two, a = two, one, jnp.stack([-a[0], jnp.ones_like(a[0])]) / a[1]
-    # Its markers, fields of other joints, are those of its first coordinate.
-    return Coupling(label, one, two, a)  # pyright: ignore[reportCallIssue]
+    return Coupling(label, on_a, on_b, one, two, a)
 
 
 def _without_zeros(a: Float[Array, " k"]) -> Float[Array, " k"]:

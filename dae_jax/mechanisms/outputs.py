@@ -30,8 +30,8 @@ def bodies_of(element: AbstractJoint | AbstractLoad) -> set[str]:
     if isinstance(element, Applied):
         return {element.body}
     on = [element.coordinate if isinstance(element, Along) else element]
-    if isinstance(element, Coupling) and element.second is not None:
-        on.append(element.second)
+    if isinstance(element, Coupling):
+        on += [element.first, element.second]
     return {x.body for part in on if isinstance(part, AbstractJoint | Coordinate) for x in (part.on_a, part.on_b)}
 
 
