@@ -23,13 +23,12 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from .. import diagnostics
 from ..consistent import violation
 from ..equations.mechanical import MechanicalODE, allowed_contradiction
 from ..solution import DAESolution
 from ..types import Args, Time
 from .configuration import Coordinate, Coordinates
-from .outputs import at_saved_times, coordinate_named
+from .outputs import at_saved_times, coordinate_named, multipliers
 from .paths import LEADING
 
 
@@ -67,9 +66,14 @@ def inverse_dynamics(
         raise ValueError("Nothing leads the mechanism: it has no `point_on_path` and no `motor(..., motion=...)`.")
     rows = mechanism.rows()
     taken = tuple(row for joint in leading for row in rows[joint.name][0])
-    multipliers = diagnostics.multipliers(mechanism.system(), sol)[:, np.array(taken)]
+    lam = multipliers(mechanism, sol)[..., np.array(taken)]
+    if lam.ndim > 2:
+        raise ValueError(
+            "`inverse_dynamics` takes one solution, but `sol` is a batch: "
+            "`jax.vmap(lambda sol: mechanism.inverse_dynamics(sol, motors))(sol)`."
+        )
     efforts = functools.partial(_efforts, taken=taken, rank=sol.rank)
-    found = at_saved_times(sol, efforts, (mechanism, along), multipliers)
+    found = at_saved_times(sol, efforts, (mechanism, along), lam)
     return dict(zip(motors, _checked(motors, sol, found).T, strict=True))
 
 

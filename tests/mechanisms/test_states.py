@@ -1,6 +1,8 @@
 """The rows of a state go with a mechanism's bodies: states of other bodies, or in another order, never pass as its own."""
 
 import diffrax
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -70,3 +72,53 @@ def test_a_state_in_another_order_is_refused(take):
 def test_a_solution_of_another_mechanism_is_refused(mechanism, show):
     with pytest.raises(ValueError, match="this one is of another mechanism, with"):
         show(solved(mechanism, mechanism.reference))
+
+
+TIMES = jnp.linspace(0.0, 0.2, 3)
+DRIVE = m.motor(JOINTS[0], torque=lambda t, c, rate, args: args, name="drive")
+LEAD = m.motor(JOINTS[1], motion=lambda t, args: args * t, name="lead")
+DRIVEN = m.Mechanism(BODIES, [*JOINTS, LEAD], [DRIVE])
+
+
+def driven(torque, saveat):
+    y0, solver = DRIVEN.assemble(args=torque), dae_jax.OrthogonalProjection(dae_jax.DOP853())
+    return dae_jax.daesolve(DRIVEN.system(rank=5), solver, 0.0, 0.2, None, y0, torque, saveat=saveat)
+
+
+def test_of_a_batch_of_solutions_each_is_shown():
+    shown = lambda sol: [
+        DRIVEN.coordinate(sol, "h"),
+        DRIVEN.rate(sol, "h"),
+        DRIVEN.effort(sol, "drive"),
+        DRIVEN.effort(sol, "lead"),
+        *DRIVEN.reaction(sol, "k"),
+        DRIVEN.power(sol),
+    ]
+    torques = jnp.array([1.0, -4.0])
+    solve = lambda torque: driven(torque, diffrax.SaveAt(ts=TIMES))
+    batch = jax.vmap(solve)(torques)
+    each = jax.tree.map(lambda *x: jnp.stack(x), *(shown(solve(torque)) for torque in torques))
+    for found, wanted in zip(jax.tree.leaves(shown(batch)), jax.tree.leaves(each), strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-8)
+    with pytest.raises(ValueError, match=r"takes one solution, but `sol` is a batch: `jax.vmap"):
+        DRIVEN.inverse_dynamics(batch, ["h", "k"])
+
+
+@pytest.mark.parametrize(
+    ("saveat", "said"),
+    [
+        (diffrax.SaveAt(dense=True), r"`sol` must have saved states: `SaveAt\(t1=True\)`"),
+        (diffrax.SaveAt(ts=TIMES, fn=lambda t, y, args: y[0]), r"leave out `SaveAt\(fn=...\)`"),
+    ],
+)
+def test_a_solution_without_states_is_refused(saveat, said):
+    sol = driven(1.0, saveat)
+    for show in (
+        lambda: DRIVEN.coordinate(sol, "h"),
+        lambda: DRIVEN.effort(sol, "lead"),
+        lambda: DRIVEN.reaction(sol, "k"),
+        lambda: DRIVEN.power(sol),
+        lambda: DRIVEN.inverse_dynamics(sol, ["h"]),
+    ):
+        with pytest.raises(ValueError, match=said):
+            show()
