@@ -65,14 +65,14 @@ def inverse_dynamics(
     if not leading:
         raise ValueError("Nothing leads the mechanism: it has no `point_on_path` and no `motor(..., motion=...)`.")
     rows = mechanism.rows()
-    taken = tuple(row for joint in leading for row in rows[joint.name][0])
-    lam = multipliers(mechanism, sol)[..., np.array(taken)]
+    led = tuple(row for joint in leading for row in rows[joint.name][0])
+    lam = multipliers(mechanism, sol)[..., np.array(led)]
     if lam.ndim > 2:
         raise ValueError(
             "`inverse_dynamics` takes one solution, but `sol` is a batch: "
             "`jax.vmap(lambda sol: mechanism.inverse_dynamics(sol, motors))(sol)`."
         )
-    efforts = functools.partial(_efforts, taken=taken, rank=sol.rank)
+    efforts = functools.partial(_efforts, led=led, rank=sol.rank)
     found = at_saved_times(sol, efforts, (mechanism, along), lam)
     return dict(zip(motors, _checked(motors, sol, found).T, strict=True))
 
@@ -83,10 +83,10 @@ def _efforts(
     y: tuple[Coordinates, Coordinates],
     lam: Array,
     args: Args,
-    taken: tuple[int, ...],
+    led: tuple[int, ...],
     rank: int | None,
 ) -> _Found:
-    (mechanism, along), (q, v) = what, y
+    (mechanism, along), (q, v), taken = what, y, np.array(led)
     ode = MechanicalODE.of(mechanism.system(), t, y, args)
     flat_q, flat_v = ode.encode(y)
     scale = _inverse_roots(mechanism.mass(q, args))
@@ -94,8 +94,8 @@ def _efforts(
     given = flat(jax.jacfwd(lambda q: mechanism.constraint(t, q, args))(q))
     rolling = flat(jax.jacfwd(lambda v: mechanism.nonholonomic(t, q, v, args))(v))
     reach = flat(jax.jacfwd(lambda q: jnp.stack([c(mechanism.configuration(q)) for c in along]))(q))
-    free = _free(jnp.concatenate([jnp.delete(given, np.array(taken), axis=0), rolling]))
-    wanted, can = -free @ (given[np.array(taken)].T @ lam), free @ reach.T
+    free = _free(jnp.concatenate([jnp.delete(given, taken, axis=0), rolling]))
+    wanted, can = -free @ (given[taken].T @ lam), free @ reach.T
     tau = jnp.linalg.lstsq(can, wanted, rcond=_half_of_the_digits(can))[0]
     s = jnp.linalg.svd(_of_length_one(jnp.concatenate([given, rolling])), compute_uv=False)
     independent = s[(rank or len(s)) - 1] > NEAR * _half_of_the_digits(s) * s[0]

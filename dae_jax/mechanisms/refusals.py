@@ -88,7 +88,7 @@ def refuse_no_solution(mechanism: "Mechanism", sol: Any) -> None:
         raise TypeError(f"`sol` must be what `daesolve` returns, but is {brief(sol)}.")
     if not isinstance(sol.ts, jax.Array):
         raise ValueError("`sol` must have saved states: `SaveAt(t1=True)` or `SaveAt(ts=...)`, without `subs`.")
-    if not isinstance(sol.ys, tuple) or len(sol.ys) != 2:
+    if not isinstance(sol.ys, tuple | list) or len(sol.ys) != 2:
         raise ValueError("`sol.ys` must hold states of this mechanism: leave out `SaveAt(fn=...)`.")
     for part in sol.ys:
         refuse_other_bodies(mechanism, part)

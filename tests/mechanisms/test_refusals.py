@@ -177,8 +177,9 @@ def test_without_a_joint():
 def test_names_of_outputs():
     mechanism = m.Mechanism([ROD], [m.revolute(m.ground, ROD, (0, 0), name="hinge")])
     q, _ = mechanism.reference
-    with pytest.raises(KeyError, match="no body 'crank'"):
-        q["crank"]
+    for reads in (lambda: q["crank"], lambda: q.put("crank", q["rod"])):
+        with pytest.raises(KeyError, match="no body 'crank'"):
+            reads()
     with pytest.raises(ValueError, match="no joint 'pin'; there are 'hinge'"):
         mechanism.reaction(None, "pin")
     with pytest.raises(ValueError, match="no motor, spring or damper 'motor'"):
