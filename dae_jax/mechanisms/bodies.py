@@ -82,8 +82,8 @@ class Body(eqx.Module):
     - `orientation`: there, in the plane an angle in rad; in space a quaternion (e₀, e₁, e₂, e₃) of any length.
     - `velocity`, `spin`: of the centre of mass, in m/s, and angular, in rad/s, in world axes: where `assemble` starts.
 
-    Errors: `ValueError` for a mass or an inertia that is not positive, or that is of another shape,
-      and for numbers that are not real and finite.
+    Errors: `ValueError` for a mass or an inertia that is not positive, and for numbers that are not real and finite, or of another
+    shape.
     """
 
     name: str = eqx.field(static=True)
