@@ -4,18 +4,18 @@ from .bodies import Body as Body, Ground as Ground, ground as ground
 from .configuration import Coordinate as Coordinate, Coordinates as Coordinates
 from .contacts import (
     between as between,
-    coupling as coupling,
     distance as distance,
     point_on_curve as point_on_curve,
     rolling as rolling,
 )
+from .couplings import coupling as coupling
 from .examples import (
     five_bar as five_bar,
     five_bar_linkage as five_bar_linkage,
     stewart_platform as stewart_platform,
 )
+from .interface import AbstractJoint as AbstractJoint
 from .joints import (
-    AbstractJoint as AbstractJoint,
     cylindrical as cylindrical,
     fixed as fixed,
     planar as planar,

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 from ..consistent import consistent_state
 from ..systems import ConstrainedSystem
 from ..types import Args, Time
+from ..validate.states import brief, refuse_wrong_state
 from ..validate.user_functions import refuse_wrong_functions
 from .bodies import GROUND, numbers
 from .configuration import Coordinate, Coordinates
@@ -40,6 +41,7 @@ def assembled(
     args: Args,
 ) -> tuple[Coordinates, Coordinates]:
     """The consistent state nearest to a guess, with these values of coordinates and rates."""
+    numbers("`t0`", t0, ())
     start = _start(mechanism, guess)
     found = _closed(mechanism, _with_values(mechanism, at, rates, t0), start, t0, args)
     if not isinstance(found[0].values, Tracer):
@@ -80,7 +82,10 @@ def _closed(
 
 def rank(mechanism: "Mechanism", y0: tuple[Coordinates, Coordinates], t0: Time, args: Args) -> tuple[int, int]:
     """The numerical rank of the constraints' Jacobians, rows scaled to length 1."""
-    (q, v), system = y0, mechanism.system()
+    system = mechanism.system()
+    refuse_wrong_state(system, y0)
+    q, v = y0
+    mechanism.configuration(q, v)
     flat_q, of_q = ravel_pytree(q)
     flat_v, of_v = ravel_pytree(v)
     if isinstance(flat_q, Tracer):
@@ -101,21 +106,20 @@ def _rank(a: Float[np.ndarray, "m n"]) -> int:
 
 def _start(mechanism: "Mechanism", guess: Any) -> tuple[Coordinates, Coordinates]:
     q, v = mechanism.reference
-    given = guess if isinstance(guess, tuple) else (guess if guess is not None else {}, {})
+    given = guess if isinstance(guess, tuple) else ({} if guess is None else guess, {})
+    if len(given) != 2 or not all(isinstance(part, Mapping | Coordinates) for part in given):
+        raise TypeError(
+            f"`guess` must be coordinates by name, {{{q.names[0]!r}: ...}}, or a pair (q, v) of them, but is {brief(guess)}."
+        )
     found = []
     for what, found_so_far, part in zip(("positions", "velocities"), (q, v), given, strict=True):
         if isinstance(part, Coordinates):
-            found.append(part)
-            continue
+            # Of another mechanism with the same bodies the order may be another.
+            part = {name: part[name] for name in part.names}
         for name, value in part.items():
-            row, known = numbers(value), found_so_far.names
-            if name not in known:
-                raise ValueError(f"`guess` has {what} of {name!r}, which is no body; bodies are {', '.join(known)}.")
-            if row.shape != found_so_far[name].shape:
-                count = len(found_so_far[name])
-                raise ValueError(
-                    f"`guess`: the {what} of {name!r} must be {count} numbers, but have the shape {row.shape}."
-                )
+            if name not in q.names:
+                raise ValueError(f"`guess` has {what} of {name!r}, which is no body; bodies are {', '.join(q.names)}.")
+            row = numbers(f"`guess` for the {what} of {name!r}", value, found_so_far[name].shape)
             found_so_far = found_so_far.put(name, row)
         found.append(found_so_far)
     return found[0], found[1]
@@ -126,13 +130,14 @@ def _with_values(
 ) -> ConstrainedSystem:
     """The mechanism's equations and those that fix values of coordinates and rates."""
     system = mechanism.system()
+    at, rates = _values("at", at), _values("rates", rates)
     if not at and not rates:
         return system
     held = _Held(
         mechanism,
         {name: coordinate_named(mechanism, name) for name in (*at, *rates)},
-        {name: numbers(value) for name, value in at.items()},
-        {name: numbers(value) for name, value in rates.items()},
+        at,
+        rates,
         jnp.asarray(t0),
     )
     has_rates = system.nonholonomic is not None or set(rates) - set(at)
@@ -143,6 +148,12 @@ def _with_values(
         system.mass,
         held.nonholonomic if has_rates else None,
     )
+
+
+def _values(what: str, given: Mapping[str, Any]) -> dict[str, Array]:
+    if not isinstance(given, Mapping):
+        raise TypeError(f"`{what}` must be values by name, {{'crank': 0.3}}, but is {brief(given)}.")
+    return {name: numbers(f"`{what}` of {name!r}", value, ()) for name, value in given.items()}
 
 
 class _Held(eqx.Module):
@@ -183,7 +194,14 @@ def _gaps(
     g = jax.jit(lambda x: jnp.ravel(constraint(t0, unflatten(x), args)))
     slope = jax.jit(jax.jacfwd(g))
     rows, closing = mechanism.rows(), _closing(mechanism)
-    weights = np.full(g(flat).shape[0], TREE)
+    g_start, slope_start = np.asarray(g(flat)), np.asarray(slope(flat))
+    for name, (g_rows, _) in rows.items():
+        if not (np.all(np.isfinite(g_start[g_rows])) and np.all(np.isfinite(slope_start[g_rows]))):
+            raise ValueError(
+                f"The equations of joint {name!r}, or their derivatives, are not finite at this guess, as those of a wheel that lies "
+                "on its plane."
+            )
+    weights = np.full(len(g_start), TREE)
     for name in closing:
         weights[rows[name][0]] = 1.0
     found = least_squares(

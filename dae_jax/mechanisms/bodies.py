@@ -26,6 +26,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from ..validate.states import brief
 from .rotations import cross, matrix, moment, plane, rates, rotate, rotate_back
 
 
@@ -81,7 +82,8 @@ class Body(eqx.Module):
     - `orientation`: there, in the plane an angle in rad; in space a quaternion (e₀, e₁, e₂, e₃) of any length.
     - `velocity`, `spin`: of the centre of mass, in m/s, and angular, in rad/s, in world axes: where `assemble` starts.
 
-    Errors: `ValueError` for a mass or an inertia that is not positive, or that is of another shape.
+    Errors: `ValueError` for a mass or an inertia that is not positive, and for numbers that are not real and finite, or of another
+    shape.
     """
 
     name: str = eqx.field(static=True)
@@ -105,18 +107,17 @@ class Body(eqx.Module):
         if not isinstance(name, str) or not name or name == GROUND:
             raise ValueError(f"A body needs a name that is not {GROUND!r}, but has {name!r}.")
         self.name = name
-        self.mass = _shaped(name, "mass", mass, ((),))
-        self.inertia = _shaped(name, "inertia", inertia, ((), (3,), (3, 3)))
+        given = lambda what, value, *shapes: numbers(f"Body {name!r}: `{what}`", value, *shapes)
+        self.mass = given("mass", mass, ())
+        self.inertia = given("inertia", inertia, (), (3,), (3, 3))
         if self.inertia.ndim == 1:
             self.inertia = jnp.diag(self.inertia)
         d = self.dimension
         turned, still = (0.0, 0.0) if d == 2 else ([1.0, 0.0, 0.0, 0.0], np.zeros(3))
-        self.at = _shaped(name, "at", np.zeros(d) if at is None else at, ((d,),))
-        self.orientation = _shaped(
-            name, "orientation", turned if orientation is None else orientation, (np.shape(turned),)
-        )
-        self.velocity = _shaped(name, "velocity", np.zeros(d) if velocity is None else velocity, ((d,),))
-        self.spin = _shaped(name, "spin", still if spin is None else spin, (np.shape(still),))
+        self.at = given("at", np.zeros(d) if at is None else at, (d,))
+        self.orientation = given("orientation", turned if orientation is None else orientation, np.shape(turned))
+        self.velocity = given("velocity", np.zeros(d) if velocity is None else velocity, (d,))
+        self.spin = given("spin", still if spin is None else spin, np.shape(still))
         if d == 3:
             length = jnp.sqrt(jnp.sum(self.orientation**2))
             if not isinstance(length, Tracer) and not length > 0:
@@ -232,25 +233,31 @@ def reference_pose(body: Body | Ground, dimension: int) -> Pose:
     return pose(reference_row(body, dimension))
 
 
-def numbers(value: Numbers) -> Array:
-    """As an array of floating-point numbers."""
-    array = jnp.asarray(value)
+def numbers(what: str, value: Numbers, *shapes: tuple[int, ...]) -> Array:
+    """What a user gives, as an array of floating-point numbers.
+
+    Errors: `ValueError` that says what it is, for what is not real and finite, or of none of these shapes if there are any.
+    """
+    expected = " or ".join(map(_in_words, shapes)) or "real numbers"
+    try:
+        # JAX takes a text for the name of a type.
+        array = jnp.asarray(None if any(isinstance(x, str | bytes) for x in jax.tree.leaves(value)) else value)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{what} must be {expected}, but is {brief(value)}.") from None
+    if jnp.iscomplexobj(array):
+        raise ValueError(f"{what} must be real, but is {brief(value)}.")
+    if shapes and array.shape not in shapes:
+        raise ValueError(f"{what} must be {expected}, but has the shape {array.shape}.")
+    if not isinstance(array, Tracer) and not np.all(np.isfinite(array)):
+        raise ValueError(f"{what} is not finite: {np.asarray(array).tolist()}.")
     return array.astype(jnp.result_type(array, float))
 
 
-def _shaped(name: str, what: str, value: Numbers, shapes: tuple[tuple[int, ...], ...]) -> Array:
-    array = numbers(value)
-    if array.shape not in shapes:
-        expected = " or ".join(str(s) if s else "a number" for s in shapes)
-        raise ValueError(f"Body {name!r}: `{what}` must be {expected}, but has the shape {array.shape}.")
-    return array
+def _in_words(shape: tuple[int, ...]) -> str:
+    return {0: "a number", 1: f"{shape[0] if shape else 0} numbers"}.get(len(shape), f"a matrix {shape}")
 
 
 def _refuse_no_mass(body: Body) -> None:
-    for what in ("mass", "inertia", "at", "orientation", "velocity", "spin"):
-        value = getattr(body, what)
-        if not isinstance(value, Tracer) and not np.all(np.isfinite(value)):
-            raise ValueError(f"Body {body.name!r}: `{what}` is not finite: {np.asarray(value).tolist()}.")
     if not isinstance(body.mass, Tracer) and not np.asarray(body.mass) > 0:
         raise ValueError(f"Body {body.name!r} has the mass {float(body.mass):g}, and must have a positive one.")
     if isinstance(body.inertia, Tracer):

@@ -25,13 +25,16 @@ class Coordinates(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
 
     def __getitem__(self, name: str) -> Float[Array, "*times k"]:
-        if name not in self.names:
-            raise KeyError(f"There is no body {name!r}; bodies are {', '.join(self.names)}.")
-        return self.values[..., self.names.index(name), :]
+        return self.values[..., self._row(name), :]
 
     def put(self, name: str, row: Float[Array, " k"]) -> "Coordinates":
         """The same with another row for one body."""
-        return Coordinates(self.values.at[self.names.index(name)].set(row), self.names)
+        return Coordinates(self.values.at[self._row(name)].set(row), self.names)
+
+    def _row(self, name: str) -> int:
+        if name not in self.names:
+            raise KeyError(f"There is no body {name!r}; bodies are {', '.join(self.names)}.")
+        return self.names.index(name)
 
 
 class Configuration:

@@ -10,14 +10,24 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..types import Args, Time
+from ..validate.user_functions import refuse_no_numbers, returned
 from .bodies import Numbers, numbers, reference_pose
 from .configuration import Configuration, Coordinate, Kind, Marker
-from .joints import AbstractHolonomicJoint, AbstractJoint, only_coordinate
-from .placement import Part, Points, dimension_of, frame_along, label_of, markers, unit
-
-
-# A ratio counts as whole up to this.
-WHOLE = 1e-9
+from .interface import AbstractHolonomicJoint, AbstractJoint
+from .placement import (
+    Part,
+    Points,
+    dimension_of,
+    frame_along,
+    label_of,
+    markers,
+    markers_of_point,
+    refuse_axis,
+    refuse_both_or_none,
+    refuse_no_function,
+    two,
+    unit,
+)
 
 
 class Distance(AbstractHolonomicJoint):
@@ -123,75 +133,6 @@ class Motion(AbstractHolonomicJoint):
         return {self.coordinate.kind: self.coordinate}
 
 
-class Coupling(AbstractHolonomicJoint):
-    """Two coordinates that go together, c₁ = Σ aₖ c₂ᵏ: a gear, a rack, a screw. Whole turns of an angle c₁ in space do not count."""
-
-    name: str = eqx.field(static=True)
-    first: Coordinate
-    second: Coordinate | None
-    coefficients: Float[Array, " k"]
-
-    @property
-    def on_a(self) -> Marker:
-        return self.first.on_a
-
-    @property
-    def on_b(self) -> Marker:
-        return self.first.on_b
-
-    def constraint(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
-        other = jnp.zeros(()) if self.second is None else self.second(at)
-        return self.first.off(at, jnp.polyval(self.coefficients[::-1], other))[None]
-
-    @property
-    def coordinates(self) -> dict[Kind, Coordinate]:
-        return {}
-
-
-def coupling(
-    first: AbstractJoint | Coordinate,
-    second: AbstractJoint | Coordinate | None,
-    coefficients: Numbers,
-    *,
-    name: str | None = None,
-) -> Coupling:
-    """Two coordinates that go together, c₁ = Σ aₖ c₂ᵏ, or one that is held, c₁ = a₀.
-
-    **Arguments**
-
-    - `first`, `second`: joints with one coordinate, or their coordinates.
-    - `coefficients`: (a₀, a₁, ...): (0, −2) is a gear of ratio 2 that turns the other way.
-
-    Errors: `ValueError` for an angle in space that would have to count its turns, which are not known there: c₂ may be one where
-    the coupling is linear and either c₁ is none, or a₁ or 1/a₁ is a whole number.
-    """
-    one, two = only_coordinate(first), None if second is None else only_coordinate(second)
-    label, a = f"coupling of {one.name}" if name is None else name, numbers(coefficients)
-    # Of what is known, `atleast_1d` is known no more in `jit`.
-    a = _without_zeros(a if a.ndim else a[None])
-    if two is not None and two.is_turn and len(a) > 1:
-        ratio = None if isinstance(a, Tracer) else float(np.asarray(a)[1])
-        whole = lambda x: abs(x - round(x)) < WHOLE
-        follows, leads = (False, False) if ratio is None else (whole(ratio), ratio != 0 and whole(1 / ratio))
-        if len(a) > 2 or (one.is_turn and not (follows or leads)):
-            raise ValueError(
-                f"Joint {label!r}: {two.name!r} has an angle in space, whose turns are not known: its powers, and multiples that are "
-                "not whole (or 1 over a whole number), would change with each. In the plane any will do."
-            )
-        if not (one.is_turn and follows):
-            # c₂ = (c₁ − a₀)/a₁ is the same, and smooth whatever turns c₂ has made.
-            one, two, a = two, one, jnp.stack([-a[0], jnp.ones_like(a[0])]) / a[1]
-    # Its markers, fields of other joints, are those of its first coordinate.
-    return Coupling(label, one, two, a)  # pyright: ignore[reportCallIssue]
-
-
-def _without_zeros(a: Float[Array, " k"]) -> Float[Array, " k"]:
-    if isinstance(a, Tracer):
-        return a
-    needed = np.flatnonzero(np.asarray(a)).max(initial=0) + 1
-    return a if needed == len(a) else a[:needed]
-
-
 def distance(
     a: Part,
     b: Part,
@@ -223,12 +164,10 @@ def between(
     `distance`.
     """
     label = label_of(a, b, name)
+    refuse_both_or_none(label, at, anchors)
     if at is None:
         return Coordinate(label, "distance", *markers(a, b, label, None, anchors))
-    if len(at) != 2:
-        raise ValueError(f"Joint {label!r}: `at` must be two points, one of each body.")
-    on_a, _ = markers(a, b, label, at[0], None)
-    _, on_b = markers(a, b, label, at[1], None)
+    (on_a, _), (_, on_b) = (markers(a, b, label, point, None) for point in two(label, "at", at))
     return Coordinate(label, "distance", on_a, on_b)
 
 
@@ -251,11 +190,11 @@ def point_on_curve(
       neither is given.
     """
     label, d = label_of(a, b, name), dimension_of(a, b)
-    if at is None:
-        on_a, on_b = markers(a, b, label, None, (jnp.zeros(d), jnp.zeros(d) if anchor is None else anchor))
-    else:
-        on_a, on_b = markers(a, b, label, at, None)
-    shape = jax.eval_shape(lambda p: jnp.asarray(curve(p)), jax.ShapeDtypeStruct((d,), on_b.point.dtype)).shape
+    on_a, on_b = markers_of_point(a, b, label, at, anchor)
+    refuse_no_function(label, "curve(p)", curve)
+    p = jax.ShapeDtypeStruct((d,), on_b.point.dtype)
+    refuse_no_numbers(returned("curve(p)", curve, p), "curve(p)")
+    shape = jax.eval_shape(lambda p: jnp.asarray(curve(p)), p).shape
     if sum(shape) >= d or len(shape) > 1:
         raise ValueError(f"Joint {label!r}: `curve(p)` must be 1 to {d - 1} equations, but has the shape {shape}.")
     return OnCurve(label, on_a, on_b, curve)
@@ -281,6 +220,8 @@ def rolling(
     """
     label, d = label_of(a, wheel, name), dimension_of(a, wheel)
     on_a, _ = markers(a, wheel, label, at, None, frame_along(unit(label, normal, d)))
+    if d == 2:
+        refuse_axis(label, axis)
     axes = jnp.eye(d) if axis is None else frame_along(unit(label, axis, d))
     _, on_b = markers(a, wheel, label, None, (jnp.zeros(d), jnp.zeros(d)), axes)
     return Rolling(label, on_a, on_b, _positive(label, "radius", radius), d == 3 and axis is not None)
@@ -291,7 +232,7 @@ def _in_reference(body: Part, at: Marker) -> Float[Array, " d"]:
 
 
 def _positive(label: str, what: str, value: Numbers) -> Float[Array, ""]:
-    number = numbers(value)
+    number = numbers(f"Joint {label!r}: `{what}`", value)
     if not isinstance(number, Tracer) and not (number.ndim == 0 and np.asarray(number) > 0):
         raise ValueError(f"Joint {label!r}: `{what}` must be a positive number, but is {value}.")
     return number

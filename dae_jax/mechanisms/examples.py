@@ -9,7 +9,8 @@ from ..scenes.scene import Scene, State, minimal
 from ..systems import ConstrainedSystem
 from .bodies import Body, ground
 from .configuration import Coordinates
-from .joints import AbstractJoint, prismatic, revolute, spherical, universal
+from .interface import AbstractJoint
+from .joints import prismatic, revolute, spherical, universal
 from .loads import AbstractLoad, damper, gravity, motor, spring
 from .mechanism import Mechanism
 

@@ -13,6 +13,7 @@ Source: A. A. Shabana, *Computational Dynamics*, section 5.10; W. Blajer, K. KoÅ
 of control constraints*, Multibody System Dynamics 11 (2004), 343â€“364.
 """
 
+import functools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -22,13 +23,12 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from .. import diagnostics
 from ..consistent import violation
 from ..equations.mechanical import MechanicalODE, allowed_contradiction
 from ..solution import DAESolution
 from ..types import Args, Time
-from .configuration import Coordinates
-from .outputs import at_saved_times, coordinate_named
+from .configuration import Coordinate, Coordinates
+from .outputs import at_saved_times, coordinate_named, multipliers
 from .paths import LEADING
 
 
@@ -64,30 +64,46 @@ def inverse_dynamics(
     leading = [joint for joint in mechanism.joints if isinstance(joint, LEADING)]
     if not leading:
         raise ValueError("Nothing leads the mechanism: it has no `point_on_path` and no `motor(..., motion=...)`.")
-    system, rows = mechanism.system(), mechanism.rows()
-    taken = np.array([row for joint in leading for row in rows[joint.name][0]])
-    multipliers = diagnostics.multipliers(system, sol)[:, taken]
+    rows = mechanism.rows()
+    led = tuple(row for joint in leading for row in rows[joint.name][0])
+    lam = multipliers(mechanism, sol)[..., np.array(led)]
+    if lam.ndim > 2:
+        raise ValueError(
+            "`inverse_dynamics` takes one solution, but `sol` is a batch: "
+            "`jax.vmap(lambda sol: mechanism.inverse_dynamics(sol, motors))(sol)`."
+        )
+    efforts = functools.partial(_efforts, led=led, rank=sol.rank)
+    found = at_saved_times(sol, efforts, (mechanism, along), lam)
+    return dict(zip(motors, _checked(motors, sol, found).T, strict=True))
 
-    def efforts(_: None, t: Time, y: tuple[Coordinates, Coordinates], lam: Array, args: Args) -> _Found:
-        (q, v), ode = y, MechanicalODE.of(system, t, y, args)
-        flat_q, flat_v = ode.encode(y)
-        scale = _inverse_roots(mechanism.mass(q, args))
-        flat = lambda slopes: slopes.values.reshape(-1, scale.size) * scale
-        given = flat(jax.jacfwd(lambda q: mechanism.constraint(t, q, args))(q))
-        rolling = flat(jax.jacfwd(lambda v: mechanism.nonholonomic(t, q, v, args))(v))
-        reach = flat(jax.jacfwd(lambda q: jnp.stack([c(mechanism.configuration(q)) for c in along]))(q))
-        free = _free(jnp.concatenate([jnp.delete(given, taken, axis=0), rolling]))
-        wanted, can = -free @ (given[taken].T @ lam), free @ reach.T
-        tau = jnp.linalg.lstsq(can, wanted, rcond=_half_of_the_digits(can))[0]
-        s = jnp.linalg.svd(_of_length_one(jnp.concatenate([given, rolling])), compute_uv=False)
-        independent = s[(sol.rank or len(s)) - 1] > NEAR * _half_of_the_digits(s) * s[0]
-        tau = jnp.where(independent, tau, jnp.nan)
-        loads = jnp.linalg.norm(scale * ode.force(t, flat_q, flat_v))
-        off = jnp.stack([jnp.max(d, initial=0) for d in violation(ode, t, (flat_q, flat_v)).distances])
-        sizes = jnp.stack([jnp.max(jnp.abs(x)) for x in (flat_q, flat_v)])
-        return _Found(tau, jnp.linalg.norm(can @ tau - wanted), jnp.linalg.norm(wanted), loads, off, sizes)
 
-    return dict(zip(motors, _checked(motors, sol, at_saved_times(sol, efforts, None, multipliers)).T, strict=True))
+def _efforts(
+    what: tuple["Mechanism", list[Coordinate]],
+    t: Time,
+    y: tuple[Coordinates, Coordinates],
+    lam: Array,
+    args: Args,
+    led: tuple[int, ...],
+    rank: int | None,
+) -> _Found:
+    (mechanism, along), (q, v), taken = what, y, np.array(led)
+    ode = MechanicalODE.of(mechanism.system(), t, y, args)
+    flat_q, flat_v = ode.encode(y)
+    scale = _inverse_roots(mechanism.mass(q, args))
+    flat = lambda slopes: slopes.values.reshape(-1, scale.size) * scale
+    given = flat(jax.jacfwd(lambda q: mechanism.constraint(t, q, args))(q))
+    rolling = flat(jax.jacfwd(lambda v: mechanism.nonholonomic(t, q, v, args))(v))
+    reach = flat(jax.jacfwd(lambda q: jnp.stack([c(mechanism.configuration(q)) for c in along]))(q))
+    free = _free(jnp.concatenate([jnp.delete(given, taken, axis=0), rolling]))
+    wanted, can = -free @ (given[taken].T @ lam), free @ reach.T
+    tau = jnp.linalg.lstsq(can, wanted, rcond=_half_of_the_digits(can))[0]
+    s = jnp.linalg.svd(_of_length_one(jnp.concatenate([given, rolling])), compute_uv=False)
+    independent = s[(rank or len(s)) - 1] > NEAR * _half_of_the_digits(s) * s[0]
+    tau = jnp.where(independent, tau, jnp.nan)
+    loads = jnp.linalg.norm(scale * ode.force(t, flat_q, flat_v))
+    off = jnp.stack([jnp.max(d, initial=0) for d in violation(ode, t, (flat_q, flat_v)).distances])
+    sizes = jnp.stack([jnp.max(jnp.abs(x)) for x in (flat_q, flat_v)])
+    return _Found(tau, jnp.linalg.norm(can @ tau - wanted), jnp.linalg.norm(wanted), loads, off, sizes)
 
 
 def _checked(motors: Sequence[str], sol: DAESolution, found: _Found) -> Float[Array, "times motors"]:

@@ -15,7 +15,6 @@ With the markers p_a, F_a = (x_a, y_a, z_a) on a and p_b, F_b on b, z (in the pl
 Source: E. J. Haug, *Computer-Aided Kinematics and Dynamics of Mechanical Systems*, sections 3.3 and 9.4.
 """
 
-import abc
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -25,56 +24,22 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from ..types import Args, Time
-from .bodies import Body, Numbers
+from .bodies import Numbers
 from .configuration import Configuration, Coordinate, Kind, Marker
-from .placement import Part, Points, dimension_of, frame_along, label_of, markers, unit
-
-
-class AbstractJoint(eqx.Module):
-    """Equations between two bodies, by name: `a` and `b`, whose markers are where reactions are taken."""
-
-    name: eqx.AbstractVar[str]
-    on_a: eqx.AbstractVar[Marker]
-    on_b: eqx.AbstractVar[Marker]
-
-    @abc.abstractmethod
-    def constraint(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
-        """What is 0 of the positions."""
-
-    @abc.abstractmethod
-    def nonholonomic(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
-        """What is 0 of the velocities, beyond the derivative of `constraint`."""
-
-    def counts(self, at: Configuration) -> tuple[int, int]:
-        """How many equations there are of positions, and how many of velocities; of joints that read no `args`."""
-        return len(self.constraint(0.0, at, None)), len(self.nonholonomic(0.0, at, None))
-
-    @property
-    @abc.abstractmethod
-    def coordinates(self) -> dict[Kind, Coordinate]:
-        """What the joint leaves free and has a number for."""
-
-    @property
-    def angle(self) -> Coordinate:
-        """That of b against a, about the joint's axis."""
-        return self._coordinate("angle")
-
-    @property
-    def displacement(self) -> Coordinate:
-        """That of b against a, along the joint's axis."""
-        return self._coordinate("displacement")
-
-    def _coordinate(self, kind: Kind) -> Coordinate:
-        if kind not in self.coordinates:
-            raise ValueError(f"Joint {self.name!r} has no {kind}.")
-        return self.coordinates[kind]
-
-
-class AbstractHolonomicJoint(AbstractJoint):
-    """One all of whose equations are of positions."""
-
-    def nonholonomic(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
-        return jnp.zeros(0)
+from .interface import AbstractHolonomicJoint
+from .placement import (
+    Part,
+    Points,
+    centre,
+    dimension_of,
+    frame_along,
+    label_of,
+    markers,
+    refuse_axis,
+    refuse_plane,
+    two,
+    unit,
+)
 
 
 class Joint(AbstractHolonomicJoint):
@@ -142,20 +107,6 @@ def pairs(joints: Sequence[Joint], at: Configuration) -> Float[Array, " m"]:
     return jnp.ravel(every)[np.array(chosen)]
 
 
-def only_coordinate(on: AbstractJoint | Coordinate) -> Coordinate:
-    """That of a joint which has one, or itself."""
-    if isinstance(on, Coordinate):
-        return on
-    found = on.coordinates
-    if len(found) != 1:
-        has = " and ".join(f"`joint.{kind}`" for kind in found)
-        raise ValueError(
-            f"Joint {on.name!r} has "
-            + (f"{has}: say which." if found else "no coordinate that a load could act along.")
-        )
-    return next(iter(found.values()))
-
-
 def revolute(
     a: Part,
     b: Part,
@@ -179,6 +130,7 @@ def revolute(
     Errors: `ValueError` for a joint of a body with itself, an axis of length 0, points of the wrong shape.
     """
     if dimension_of(a, b) == 2:
+        refuse_axis(label_of(a, b, name), axis)
         return _pair("revolute", a, b, at, anchors, name, (0, 1), (), ("angle",), axis)
     return _pair("revolute", a, b, at, anchors, name, (0, 1, 2), ((0, 2), (1, 2)), ("angle",), axis)
 
@@ -195,7 +147,7 @@ def prismatic(
     """A slider: b moves along an axis that is fixed in a, and does not turn against it. Arguments as those of `revolute`; without
     `at`, the point is b's centre of mass.
     """
-    at = _centre(b, at, anchors)
+    at = centre(b, at, anchors)
     if dimension_of(a, b) == 2:
         return _pair("prismatic", a, b, at, anchors, name, (1,), ((0, 1),), ("displacement",), axis)
     rows = ((0, 2), (1, 2), (0, 1))
@@ -214,8 +166,8 @@ def cylindrical(
     """b moves along an axis of a and turns about it; in space. Arguments as those of `prismatic`. It has two coordinates, `joint.angle`
     and `joint.displacement`.
     """
-    _refuse_plane("cylindrical", a, b)
-    at = _centre(b, at, anchors)
+    refuse_plane("cylindrical", a, b)
+    at = centre(b, at, anchors)
     return _pair("cylindrical", a, b, at, anchors, name, (0, 1), ((0, 2), (1, 2)), ("angle", "displacement"), axis)
 
 
@@ -223,7 +175,7 @@ def spherical(
     a: Part, b: Part, at: Numbers | None = None, *, anchors: Points | None = None, name: str | None = None
 ) -> Joint:
     """A ball joint: b turns freely against a about a point; in space. Arguments as those of `revolute`."""
-    _refuse_plane("spherical", a, b)
+    refuse_plane("spherical", a, b)
     return _pair("spherical", a, b, at, anchors, name, (0, 1, 2), (), (), (0, 0, 1))
 
 
@@ -239,9 +191,9 @@ def universal(
     """A Cardan joint: `axes` are that fixed in a and that fixed in b, perpendicular in the reference configuration and ever after; in
     space. Other arguments as those of `revolute`.
     """
-    _refuse_plane("universal", a, b)
+    refuse_plane("universal", a, b)
     label = label_of(a, b, name)
-    x, y = (unit(label, axis, 3) for axis in axes)
+    x, y = (unit(label, axis, 3) for axis in two(label, "axes", axes))
     slant = jnp.sum(x * y)
     if not isinstance(slant, Tracer) and abs(slant) > 1e-6:
         raise ValueError(f"Joint {label!r}: the two axes of a universal joint must be perpendicular.")
@@ -259,8 +211,8 @@ def planar(
     name: str | None = None,
 ) -> Joint:
     """b slides on a plane of a and turns about its normal, its angle; in space. Arguments as those of `prismatic`."""
-    _refuse_plane("planar", a, b)
-    at = _centre(b, at, anchors)
+    refuse_plane("planar", a, b)
+    at = centre(b, at, anchors)
     return _pair("planar", a, b, at, anchors, name, (2,), ((0, 2), (1, 2)), ("angle",), normal)
 
 
@@ -268,7 +220,7 @@ def fixed(
     a: Part, b: Part, at: Numbers | None = None, *, anchors: Points | None = None, name: str | None = None
 ) -> Joint:
     """b does not move against a. Arguments as those of `prismatic`."""
-    at = _centre(b, at, anchors)
+    at = centre(b, at, anchors)
     if dimension_of(a, b) == 2:
         return _pair("fixed", a, b, at, anchors, name, (0, 1), ((0, 1),), (), None)
     return _pair("fixed", a, b, at, anchors, name, (0, 1, 2), ((0, 2), (1, 2), (0, 1)), (), (0, 0, 1))
@@ -293,12 +245,3 @@ def _pair(
             raise ValueError(f"Joint {label!r}: a {joint} joint in space needs an axis.")
         axes = jnp.eye(2) if axis is None else frame_along(unit(label, axis, d))
     return Joint(label, *markers(a, b, label, at, anchors, axes), locked, perpendicular, free)
-
-
-def _refuse_plane(joint: str, a: Part, b: Part) -> None:
-    if dimension_of(a, b) == 2:
-        raise ValueError(f"A {joint} joint is one of bodies in space, but {a.name!r} and {b.name!r} are planar.")
-
-
-def _centre(b: Part, at: Numbers | None, anchors: Points | None) -> Numbers | None:
-    return b.at if at is None and anchors is None and isinstance(b, Body) else at

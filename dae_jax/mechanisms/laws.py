@@ -63,8 +63,12 @@ class Drive(Law):
     torque: Callable[..., Array] | Float[Array, ""]
 
     def effort(self, t: Time, c: Scalar, rate: Scalar, args: Args) -> Scalar:
-        given = self.torque(t, c, rate, args) if callable(self.torque) else self.torque
-        return jnp.reshape(jnp.asarray(given), ()).astype(c.dtype)
+        given = jnp.asarray(self.torque(t, c, rate, args) if callable(self.torque) else self.torque)
+        if jnp.iscomplexobj(given):
+            raise ValueError(
+                "`torque(t, c, rate, args)` of a motor must return a real number, but returns a complex one."
+            )
+        return jnp.reshape(given, ()).astype(c.dtype)
 
     def energy(self, c: Scalar) -> Scalar | None:
         return None

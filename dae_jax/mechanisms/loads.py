@@ -16,11 +16,13 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..types import Args, Scalar, Time
+from ..validate.states import brief
 from .bodies import Body, Numbers, generalised, numbers, pose
 from .configuration import Configuration, Coordinate, MarkerArrays, is_within_half_a_turn, value
 from .contacts import Motion
-from .joints import AbstractJoint, only_coordinate
+from .interface import AbstractJoint, only_coordinate
 from .laws import HALF_TURN, Drive, Friction, Law, Spring
+from .placement import refuse_no_function
 from .rotations import rotate
 
 
@@ -133,7 +135,7 @@ class Applied(AbstractLoad):
 
 def gravity(acceleration: Numbers, name: str = "gravity") -> Gravity:
     """The weight of all bodies by an acceleration in m/s², such as (0, −9.81): (2,) or (3,)."""
-    return Gravity(name, numbers(acceleration))
+    return Gravity(name, numbers(f"Load {name!r}: `acceleration`", acceleration, (2,), (3,)))
 
 
 def spring(
@@ -153,7 +155,7 @@ def spring(
 
     Errors: `ValueError` where the rest of an angle in space is half a turn off or more.
     """
-    label, coordinate = _named("spring", on, name), only_coordinate(on)
+    label, coordinate = _along("spring", on, name)
     law = Spring(_number(label, "stiffness", stiffness), _number(label, "rest", rest), coordinate.is_turn)
     if law.is_turn and not isinstance(law.rest, Tracer) and np.abs(law.rest) >= HALF_TURN:
         raise ValueError(
@@ -165,8 +167,8 @@ def spring(
 
 def damper(on: AbstractJoint | Coordinate, damping: Numbers, *, name: str | None = None) -> Along:
     """A linear damper, τ = −d ċ, with d in N s/m or N m s. `on` is as that of `spring`."""
-    label = _named("damper", on, name)
-    return Along(label, only_coordinate(on), Friction(_number(label, "damping", damping), None, jnp.ones(())))
+    label, coordinate = _along("damper", on, name)
+    return Along(label, coordinate, Friction(_number(label, "damping", damping), None, jnp.ones(())))
 
 
 def friction(
@@ -186,12 +188,12 @@ def friction(
     - `viscous`: d.
     - `smoothing`: ε, in rad/s or m/s: below this speed dry friction creeps, where in truth it sticks. The smaller, the stiffer.
     """
-    label = _named("friction", on, name)
+    label, coordinate = _along("friction", on, name)
     given = (("viscous", viscous), ("coulomb", coulomb), ("smoothing", smoothing))
     law = Friction(*(_number(label, what, value) for what, value in given))
     if not isinstance(law.smoothing, Tracer) and not np.asarray(law.smoothing) > 0:
         raise ValueError(f"Load {label!r}: `smoothing` must be a positive speed, but is {smoothing}.")
-    return Along(label, only_coordinate(on), law)
+    return Along(label, coordinate, law)
 
 
 def motor(
@@ -211,14 +213,15 @@ def motor(
 
     Errors: `ValueError` unless one of the two is given.
     """
-    label = _named("motor", on, name)
+    label, coordinate = _along("motor", on, name)
     if (torque is None) == (motion is None):
         raise ValueError(f"Motor {label!r} needs either a `torque` or a `motion`.")
     if motion is not None:
+        refuse_no_function(label, "motion(t, args)", motion)
         # Its markers, fields of other joints, are those of its coordinate.
-        return Motion(label, only_coordinate(on), motion)  # pyright: ignore[reportCallIssue]
+        return Motion(label, coordinate, motion)  # pyright: ignore[reportCallIssue]
     assert torque is not None
-    return Along(label, only_coordinate(on), Drive(torque if callable(torque) else numbers(torque)))
+    return Along(label, coordinate, Drive(torque if callable(torque) else _number(label, "torque", torque)))
 
 
 def force(
@@ -237,12 +240,10 @@ def force(
     - `at`: where it acts on the body, a point in the world in the reference configuration; its centre of mass if not given.
     - `axes`: whether the numbers are along the axes of the world or of the body.
     """
-    label, point = name or f"force on {body.name}", jnp.zeros(body.dimension)
+    label, point = _on_body("force", body, name), jnp.zeros(body.dimension)
     if at is not None:
-        if numbers(at).shape != point.shape:
-            raise ValueError(f"Load {label!r}: `at` must have the shape {point.shape}, but has {numbers(at).shape}.")
-        point = pose(body.reference[0]).local(numbers(at))
-    return Applied(label, body.name, "force", _axes(label, axes), _value(value), point)
+        point = pose(body.reference[0]).local(numbers(f"Load {label!r}: `at`", at, point.shape))
+    return Applied(label, body.name, "force", _axes(label, axes), _value(label, value), point)
 
 
 def torque(
@@ -253,19 +254,23 @@ def torque(
     name: str | None = None,
 ) -> Applied:
     """A moment on a body, a number in N m in the plane, (3,) in space, or `value(t, q, v, args)`. Other arguments as those of `force`."""
-    label, zero = name or f"torque on {body.name}", jnp.zeros(body.dimension)
-    return Applied(label, body.name, "torque", _axes(label, axes), _value(value), zero)
+    label, zero = _on_body("torque", body, name), jnp.zeros(body.dimension)
+    return Applied(label, body.name, "torque", _axes(label, axes), _value(label, value), zero)
 
 
-def _named(kind: str, on: AbstractJoint | Coordinate, name: str | None) -> str:
-    return f"{kind} on {on.name}" if name is None else name
+def _along(kind: str, on: AbstractJoint | Coordinate, name: str | None) -> tuple[str, Coordinate]:
+    coordinate = only_coordinate(on)
+    return f"{kind} on {on.name}" if name is None else name, coordinate
+
+
+def _on_body(kind: str, body: Body, name: str | None) -> str:
+    if not isinstance(body, Body):
+        raise TypeError(f"A {kind} acts on a body, but {brief(body)} is none.")
+    return name or f"{kind} on {body.name}"
 
 
 def _number(label: str, what: str, value: Numbers) -> Float[Array, ""]:
-    number = numbers(value)
-    if number.ndim:
-        raise ValueError(f"Load {label!r}: `{what}` must be a number, but has the shape {number.shape}.")
-    return number
+    return numbers(f"Load {label!r}: `{what}`", value, ())
 
 
 def _axes(label: str, axes: Literal["world", "body"]) -> Literal["world", "body"]:
@@ -274,5 +279,5 @@ def _axes(label: str, axes: Literal["world", "body"]) -> Literal["world", "body"
     return axes
 
 
-def _value(value: Numbers | Callable[..., Array]) -> Array | Callable[..., Array]:
-    return value if callable(value) else numbers(value)
+def _value(label: str, value: Numbers | Callable[..., Array]) -> Array | Callable[..., Array]:
+    return value if callable(value) else numbers(f"Load {label!r}: `value`", value)

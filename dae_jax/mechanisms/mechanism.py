@@ -14,12 +14,14 @@ from ..systems import ConstrainedSystem
 from ..types import Args, Scalar, Time
 from ..validate.states import brief
 from . import assembly, outputs
-from .bodies import GROUND, Body, inertial_force, mass_block
+from .bodies import Body, inertial_force, mass_block
 from .configuration import Configuration, Coordinates
 from .drawing import drawing
+from .interface import AbstractJoint
 from .inverse_dynamics import inverse_dynamics
-from .joints import AbstractJoint, Joint, pairs
-from .loads import AbstractLoad, Along, Gravity, along
+from .joints import Joint, pairs
+from .loads import AbstractLoad, Along, along
+from .refusals import refuse_other_bodies, refuse_what_does_not_fit
 
 
 class Mechanism(eqx.Module):
@@ -58,7 +60,7 @@ class Mechanism(eqx.Module):
         # A motor whose motion is given is an equation, whatever list it is in.
         self.joints = tuple(x for x in given if isinstance(x, AbstractJoint))
         self.loads = tuple(x for x in given if isinstance(x, AbstractLoad))
-        _refuse_what_does_not_fit(self, given)
+        refuse_what_does_not_fit(self, given)
 
     @property
     def dimension(self) -> int:
@@ -67,11 +69,8 @@ class Mechanism(eqx.Module):
 
     def configuration(self, q: Coordinates, v: Coordinates | None = None) -> Configuration:
         """All bodies at one instant."""
-        if not isinstance(q, Coordinates):
-            raise TypeError(
-                f"A state of a Mechanism is a pair of `Coordinates`, as `assemble` gives it and takes it from a guess by name, but "
-                f"is {brief(q)}."
-            )
+        for part in (q,) if v is None else (q, v):
+            refuse_other_bodies(self, part)
         return Configuration(self.bodies, q, v)
 
     # The equations
@@ -252,34 +251,3 @@ class Mechanism(eqx.Module):
         is the derivative of `energy`.
         """
         return outputs.power(self, sol)
-
-
-def _refuse_what_does_not_fit(mechanism: Mechanism, given: Sequence[AbstractJoint | AbstractLoad]) -> None:
-    if not mechanism.bodies:
-        raise ValueError("A mechanism needs a body.")
-    for body in mechanism.bodies:
-        if not isinstance(body, Body):
-            raise TypeError(
-                f"`bodies` must be made by `Body`, but has {brief(body)}: the order is bodies, joints, loads."
-            )
-    for x in given:
-        if not isinstance(x, AbstractJoint | AbstractLoad):
-            raise TypeError(f"A mechanism is made of bodies, joints and loads, but {brief(x)} is no joint and no load.")
-    names = [body.name for body in mechanism.bodies]
-    for what, listed in (("bodies", names), ("joints or loads", [x.name for x in given])):
-        twice = sorted({name for name in listed if listed.count(name) > 1})
-        if twice:
-            raise ValueError(f"Two {what} have the name {twice[0]!r}: give one of them another by `name=`.")
-    planar = [body.name for body in mechanism.bodies if body.dimension == 2]
-    if planar and len(planar) < len(names):
-        spatial = next(name for name in names if name not in planar)
-        raise ValueError(
-            f"Body {planar[0]!r} is planar and body {spatial!r} is spatial: a mechanism is one or the other."
-        )
-    for x in given:
-        if isinstance(x, Gravity) and x.acceleration.shape != (mechanism.dimension,):
-            raise ValueError(f"{x.name!r} must have {mechanism.dimension} components, but has {x.acceleration.shape}.")
-        for name in sorted(outputs.bodies_of(x) - {*names, GROUND}):
-            raise ValueError(
-                f"{x.name!r} is on the body {name!r}, which is none of the mechanism's: {', '.join(names)}."
-            )

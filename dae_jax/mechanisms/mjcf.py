@@ -9,10 +9,11 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Float
 
-from . import contacts, joints, loads
+from ..validate.states import brief
+from . import couplings, joints, loads
 from .bodies import Body, Ground, ground
 from .configuration import Coordinate
-from .joints import AbstractJoint
+from .interface import AbstractJoint
 from .loads import AbstractLoad
 from .mechanism import Mechanism
 
@@ -57,6 +58,8 @@ def read_mjcf(source: str | os.PathLike[str]) -> Mechanism:
         mujoco: Model = importlib.import_module("mujoco")
     except ImportError as missing:
         raise ImportError('`read_mjcf` reads files by MuJoCo: pip install "dae_jax[mjcf]".') from missing
+    if not isinstance(source, str | os.PathLike):
+        raise TypeError(f"`source` must be the path of a file or the text of one, but is {brief(source)}.")
     text = os.fspath(source)
     model = (mujoco.MjModel.from_xml_string if text.lstrip().startswith("<") else mujoco.MjModel.from_xml_path)(text)
     reader = _Reader(model, mujoco.MjData(model), mujoco)
@@ -120,12 +123,8 @@ class _Reader:
 
     def _refuse_other_physics(self) -> None:
         model = self.model
-        for count, what in (
-            (model.ntendon, "tendons"),
-            (model.nflex, "flexible bodies"),
-            (model.nmocap, "mocap bodies"),
-            (getattr(model, "nplugin", 0), "plugins"),
-        ):
+        counts = {"tendons": model.ntendon, "flexible bodies": model.nflex, "mocap bodies": model.nmocap}
+        for what, count in (counts | {"plugins": getattr(model, "nplugin", 0)}).items():
             if count:
                 self.unsupported.append(f"{count} {what}")
         for kind, known in KNOWN.items():
@@ -136,11 +135,12 @@ class _Reader:
             self.unsupported.append("a fluid around the bodies (density, viscosity)")
 
     def _refuse_field(self, kind: str, field: str) -> None:
-        """What is set (0 and −1 are nothing) of a field that is not known."""
+        """What is set of a field that is not known: 0 is nothing, and of whole numbers, which are ids, −1."""
         rows = np.asarray(getattr(self.model, field))
         if rows.ndim == 0 or (field == "dof_frictionloss" and self._disabled("FRICTIONLOSS", "CONSTRAINT")):
             return
-        owners = np.flatnonzero(((rows != 0) & (rows != -1)).any(tuple(range(1, rows.ndim))))
+        nothing = (0, -1) if np.issubdtype(rows.dtype, np.integer) else (0,)
+        owners = np.flatnonzero((~np.isin(rows, nothing)).any(tuple(range(1, rows.ndim))))
         if kind == "dof":
             owners = np.unique(self.model.dof_jntid[owners])
         for k in owners:
@@ -240,6 +240,9 @@ class _Reader:
         a, b = self._part(one), self._part(two)
         if a is None or b is None:
             return
+        if a is b:
+            self.unsupported.append(f"equality {name!r}, which is between two parts of {a.name!r}")
+            return
         turns, on_two = data.xmat.reshape(-1, 3, 3), numbers[3:6] if kind == CONNECT else numbers[:3]
         # Of a weld without a torque only the points are one.
         if kind == CONNECT or numbers[10] == 0:
@@ -264,7 +267,9 @@ class _Reader:
             self.unsupported.append(f"equality {name!r} of a joint that has not one coordinate")
         else:
             other = self.coordinates[two] if two >= 0 else None
-            self._take(self.joints, contacts.coupling, self.coordinates[one], other, numbers[:5], name=name)
+            # MuJoCo reads the first alone where there is no second joint.
+            powers = numbers[: 1 if other is None else 5]
+            self._take(self.joints, couplings.coupling, self.coordinates[one], other, powers, name=name)
 
     def _take(self, parts: list[Any], make: Callable[..., Any], *arguments: object, **options: object) -> None:
         """Adds what is made, or why it cannot be made to what is not supported."""

@@ -1,38 +1,29 @@
-"""What a mechanism's solution shows: coordinates, efforts, reactions, power."""
+"""What a mechanism's solution shows: coordinates, efforts, reactions, power; of a batch of solutions with the batch's axes first."""
 
 import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Literal
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
 from .. import diagnostics, solution
-from ..solution import DAESolution, without_padding
-from ..types import Args, Time
+from ..solution import DAESolution
+from ..types import Args, State, Time
 from ..validate.captured import current
 from .bodies import GROUND, wrench
 from .configuration import Configuration, Coordinate, Coordinates
-from .contacts import Coupling, Motion
-from .joints import AbstractJoint
-from .loads import AbstractLoad, Along, Applied
+from .contacts import Motion
+from .loads import AbstractLoad, Along
 from .paths import LEADING
+from .refusals import refuse_no_solution
 from .rotations import moment, rotate_back
 
 
 if TYPE_CHECKING:
     from .mechanism import Mechanism
-
-
-def bodies_of(element: AbstractJoint | AbstractLoad) -> set[str]:
-    """The bodies that a joint or a load names."""
-    if isinstance(element, Applied):
-        return {element.body}
-    on = [element.coordinate if isinstance(element, Along) else element]
-    if isinstance(element, Coupling) and element.second is not None:
-        on.append(element.second)
-    return {x.body for part in on if isinstance(part, AbstractJoint | Coordinate) for x in (part.on_a, part.on_b)}
 
 
 def coordinate_named(mechanism: "Mechanism", name: str) -> Coordinate:
@@ -71,7 +62,7 @@ def effort(mechanism: "Mechanism", sol: DAESolution, name: str) -> Float[Array, 
         if joint.name == name and isinstance(joint, Motion):
             (row,), _ = mechanism.rows()[name]
             # g grows with c at the rate 1 where it is 0, and pulls by −λ.
-            return -diagnostics.multipliers(mechanism.system(), sol)[..., row]
+            return -multipliers(mechanism, sol)[..., row]
     known = [x.name for x in (*mechanism.loads, *mechanism.joints) if isinstance(x, Along | Motion)]
     raise ValueError(
         f"There is no motor, spring or damper {name!r}; there are {', '.join(map(repr, known)) or 'none'}."
@@ -87,18 +78,17 @@ def reaction(
         raise ValueError(f"There is no joint {name!r}; there are {', '.join(repr(j.name) for j in mechanism.joints)}.")
     if axes not in ("world", "body"):
         raise ValueError(f"`axes` must be 'world' or 'body', but is {axes!r}.")
-    multipliers, rows = diagnostics.multipliers(mechanism.system(), sol), mechanism.rows()
-    holonomic = multipliers.shape[-1] - sum(len(h) for _, h in rows.values())
+    every, rows = multipliers(mechanism, sol), mechanism.rows()
+    holonomic = every.shape[-1] - sum(len(h) for _, h in rows.values())
     g_rows, h_rows = rows[name]
-    lam, mu = multipliers[..., jnp.array(g_rows, int)], multipliers[..., jnp.array(h_rows, int) + holonomic]
+    lam, mu = every[..., jnp.array(g_rows, int)], every[..., jnp.array(h_rows, int) + holonomic]
     return at_saved_times(sol, functools.partial(_reaction, axes=axes), (mechanism, joint), lam, mu)
 
 
-def leading_force(mechanism: "Mechanism", sol: DAESolution, name: str) -> Float[Array, "times bodies k"]:
-    """−(∂l/∂q)ᵀ λ, the generalised force on all bodies of what leads by l(t, q) = 0."""
-    joint = next(joint for joint in mechanism.joints if joint.name == name)
-    lam = diagnostics.multipliers(mechanism.system(), sol)[..., jnp.array(mechanism.rows()[name][0], int)]
-    return at_saved_times(sol, _leading_force, (mechanism, joint), lam)
+def multipliers(mechanism: "Mechanism", sol: DAESolution) -> Float[Array, "*batch times mp"]:
+    """(λ, μ) at each saved time."""
+    refuse_no_solution(mechanism, sol)
+    return diagnostics.multipliers(mechanism.system(), sol)
 
 
 def energy(mechanism: "Mechanism", sol: DAESolution) -> Float[Array, " times"]:
@@ -108,6 +98,7 @@ def energy(mechanism: "Mechanism", sol: DAESolution) -> Float[Array, " times"]:
 
 def power(mechanism: "Mechanism", sol: DAESolution) -> dict[str, Float[Array, " times"]]:
     """Q·v of each load without a potential and of what leads."""
+    refuse_no_solution(mechanism, sol)
     at_start = mechanism.configuration(*mechanism.reference)
     found = {
         load.name: _at_saved_times((mechanism, load), sol, _work)
@@ -116,8 +107,8 @@ def power(mechanism: "Mechanism", sol: DAESolution) -> dict[str, Float[Array, " 
     }
     for joint in mechanism.joints:
         if isinstance(joint, LEADING):
-            work = leading_force(mechanism, sol, joint.name) * without_padding(sol.ts, sol.ys)[1][1].values
-            found[joint.name] = jnp.sum(work, (1, 2))
+            lam = multipliers(mechanism, sol)[..., jnp.array(mechanism.rows()[joint.name][0], int)]
+            found[joint.name] = at_saved_times(sol, _leading_work, (mechanism, joint), lam)
     return found
 
 
@@ -138,10 +129,11 @@ def _reaction(what: Any, t: Time, y: Any, lam: Array, mu: Array, args: Args, axe
     return force, torque
 
 
-def _leading_force(what: Any, t: Time, y: tuple[Coordinates, Coordinates], lam: Array, args: Args) -> Array:
-    mechanism, joint = what
-    _, pull = jax.vjp(lambda q: joint.constraint(t, mechanism.configuration(q), args), y[0])
-    return -pull(lam)[0].values
+def _leading_work(what: Any, t: Time, y: tuple[Coordinates, Coordinates], lam: Array, args: Args) -> Array:
+    """−λ·(∂l/∂q) v, of what leads by l(t, q) = 0."""
+    (mechanism, joint), (q, v) = what, y
+    _, pull = jax.vjp(lambda q: joint.constraint(t, mechanism.configuration(q), args), q)
+    return -jnp.sum(pull(lam)[0].values * v.values)
 
 
 def _work(load: AbstractLoad, t: Time, at: Configuration, args: Args) -> Array:
@@ -154,9 +146,19 @@ _rate = lambda c, t, at, args: c.with_rate(at)[1]
 _effort = lambda load, t, at, args: load.effort(t, at, args)
 
 
-def at_saved_times(sol: DAESolution, of: Callable[..., Any], what: PyTree, *more: Array) -> Any:
-    """of(what, t, y, *more, args) at each saved time; `more` has these along its first axis."""
-    return solution.at_saved_times(current(of), current(what), sol.ts, sol.ys, sol.args, sol.changed, *more)
+def at_saved_times(sol: DAESolution, of: Callable[..., Any], what: tuple["Mechanism", Any], *more: Array) -> Any:
+    """of(what, t, y, *more, args) at each saved time, for a mechanism and parts of it; of a batch of solutions, of each. `more` has
+    the axes of `sol.ts`.
+    """
+    refuse_no_solution(what[0], sol)
+    of, what = current(of), current(what)
+
+    def along(ts: Float[Array, "*batch times"], ys: State, args: Args, changed: Args, *more: Array) -> Any:
+        if ts.ndim > 1:
+            return eqx.filter_vmap(along)(ts, ys, args, changed, *more)
+        return solution.at_saved_times(of, what, ts, ys, args, changed, *more)
+
+    return along(sol.ts, sol.ys, sol.args, sol.changed, *more)
 
 
 def _at_saved_times(

@@ -10,8 +10,8 @@ from ..types import Args, Time
 from .bodies import Numbers
 from .configuration import Configuration, Coordinate, Kind, Marker
 from .contacts import Motion
-from .joints import AbstractHolonomicJoint
-from .placement import Part, dimension_of, label_of, markers
+from .interface import AbstractHolonomicJoint
+from .placement import Part, label_of, markers_of_point, refuse_no_function
 
 
 class OnPath(AbstractHolonomicJoint):
@@ -63,9 +63,6 @@ def point_on_path(
 
     Errors: `ValueError` for a path of another shape.
     """
-    label, d = label_of(a, b, name), dimension_of(a, b)
-    if at is None:
-        on_a, on_b = markers(a, b, label, None, (jnp.zeros(d), jnp.zeros(d) if anchor is None else anchor))
-    else:
-        on_a, on_b = markers(a, b, label, at, None)
-    return OnPath(label, on_a, on_b, path)
+    label = label_of(a, b, name)
+    refuse_no_function(label, "path(t, args)", path)
+    return OnPath(label, *markers_of_point(a, b, label, at, anchor), path)

@@ -22,20 +22,47 @@ def markers(
 ) -> tuple[Marker, Marker]:
     """Those of a joint on a and b, from a point in the world or from a point of each."""
     d = dimension_of(a, b)
-    if (at is None) == (anchors is None):
-        raise ValueError(
-            f"Joint {label!r}: give either `at`, a point in the world, or `anchors`, a point of each body."
-        )
+    refuse_both_or_none(label, at, anchors)
     axes = jnp.eye(d) if axes is None else axes
     if anchors is None:
         assert at is not None
         point = _vector(label, "at", at, d)
         return marker(a, point, axes), marker(b, point, axes)
-    if len(anchors) != 2:
-        raise ValueError(f"Joint {label!r}: `anchors` must be two points, one of each body.")
-    local = [_vector(label, "anchors", p, d) for p in anchors]
+    local = [_vector(label, "anchors", p, d) for p in two(label, "anchors", anchors)]
     on = [marker(body, jnp.zeros(d), axes) for body in (a, b)]
     return on[0].moved_to(local[0]), on[1].moved_to(local[1])
+
+
+def refuse_both_or_none(label: str, at: object, anchors: object) -> None:
+    """Refuses a place that is given twice, or not at all."""
+    if (at is None) == (anchors is None):
+        raise ValueError(
+            f"Joint {label!r}: give either `at`, a point in the world, or `anchors`, a point of each body."
+        )
+
+
+def markers_of_point(a: Part, b: Part, label: str, at: Numbers | None, anchor: Numbers | None) -> tuple[Marker, Marker]:
+    """The axes of a, and a point of b, its centre of mass if none is given."""
+    if at is not None and anchor is not None:
+        raise ValueError(f"Joint {label!r}: give either `at`, a point in the world, or `anchor`, one of {b.name!r}.")
+    if at is not None:
+        return markers(a, b, label, at, None)
+    zero = jnp.zeros(dimension_of(a, b))
+    return markers(a, b, label, None, (zero, zero if anchor is None else anchor))
+
+
+def centre(b: Part, at: Numbers | None, anchors: Points | None) -> Numbers | None:
+    """Where a joint is: at b's centre of mass, where no point is given."""
+    return b.at if at is None and anchors is None and isinstance(b, Body) else at
+
+
+def two(label: str, what: str, given: Points) -> Points:
+    """Two points or axes, one of each body."""
+    try:
+        first, second = given
+    except (TypeError, ValueError):
+        raise ValueError(f"Joint {label!r}: `{what}` must be two, one of each body, but is {brief(given)}.") from None
+    return first, second
 
 
 def dimension_of(a: Part, b: Part) -> Literal[2, 3]:
@@ -52,8 +79,27 @@ def dimension_of(a: Part, b: Part) -> Literal[2, 3]:
     return 2 if found == {2} else 3
 
 
+def refuse_plane(joint: str, a: Part, b: Part) -> None:
+    """Refuses bodies in the plane."""
+    if dimension_of(a, b) == 2:
+        raise ValueError(f"A {joint} joint is one of bodies in space, but {a.name!r} and {b.name!r} are planar.")
+
+
+def refuse_axis(label: str, axis: Numbers | None) -> None:
+    """Refuses an axis of what turns in the plane."""
+    if axis is not None:
+        raise ValueError(f"Joint {label!r}: bodies in the plane turn about its normal, and `axis` is none of theirs.")
+
+
+def refuse_no_function(label: str, call: str, given: object) -> None:
+    """Refuses what cannot be called."""
+    if not callable(given):
+        raise TypeError(f"{label!r} must have a function `{call}`, but has {brief(given)}.")
+
+
 def label_of(a: Part, b: Part, name: str | None) -> str:
     """The name of what is between two bodies, which must not be the same."""
+    dimension_of(a, b)
     label = f"{a.name}-{b.name}" if name is None else name
     if a.name == b.name:
         raise ValueError(f"Joint {label!r} is between {a.name!r} and itself, and needs two bodies.")
@@ -61,10 +107,7 @@ def label_of(a: Part, b: Part, name: str | None) -> str:
 
 
 def _vector(label: str, what: str, value: Numbers, d: int) -> Float[Array, " d"]:
-    array = numbers(value)
-    if array.shape != (d,):
-        raise ValueError(f"Joint {label!r}: `{what}` must be of {d} numbers, but has the shape {array.shape}.")
-    return array
+    return numbers(f"Joint {label!r}: `{what}`", value, (d,))
 
 
 def unit(label: str, axis: Numbers, d: int) -> Float[Array, " d"]:

@@ -347,3 +347,21 @@ def test_nothing_is_asked_of_what_is_in_balance():
     mechanism = m.Mechanism([rod, slide], [hinge, rail, hold], [m.gravity((0, -GRAVITY))])
     still = along(mechanism, lambda t: mechanism.reference[0].values + 0 * t, jnp.zeros(3))
     np.testing.assert_allclose(mechanism.inverse_dynamics(still, ["rail"])["rail"], 0, atol=1e-12)
+
+
+SWING = 1.0
+
+
+def swing(t, args):
+    return SWING * t**2
+
+
+def test_a_changed_global_is_seen(monkeypatch):
+    hinge = m.revolute(m.ground, wheel := m.Body("wheel", 1.0, 0.5), (0, 0), name="hinge")
+    mechanism = m.Mechanism([wheel], [hinge, m.motor(hinge, motion=swing, name="drive")])
+    for value in (1.0, 2.0):
+        monkeypatch.setitem(globals(), "SWING", value)
+        sol = solved(mechanism, jnp.array([0.5, 1.0]))
+        torque = mechanism.inverse_dynamics(sol, ["hinge"])["hinge"]
+        np.testing.assert_allclose(torque, value, rtol=1e-6)
+        np.testing.assert_allclose(mechanism.effort(sol, "drive"), value, rtol=1e-6)

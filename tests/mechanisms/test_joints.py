@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import dae_jax
 from dae_jax import mechanisms as m
 
 
@@ -145,6 +146,24 @@ def test_a_gear_couples_two_angles():
     q, v = mechanism.assemble(at={"two": 0.3}, rates={"two": 1.0})
     assert float(q["a"][2]) == pytest.approx(0.4 - 0.6)
     assert float(v["a"][2]) == pytest.approx(-2.0)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("ratio", [2.0, 0.5])
+def test_the_reaction_of_a_gear_is_on_the_second_body_of_its_first_joint(dimension: int, ratio: float):
+    """J α − T of the wheel that a motor drives by T, whichever of the two angles the equation is solved for."""
+    axis, inertia = (None, (0.3, 0.7)) if dimension == 2 else ((0, 0, 1), ((0.3,) * 3, (0.7,) * 3))
+    places = [(0, 0, 0)[:dimension], (3, 0, 0)[:dimension]]
+    wheels = [m.Body(name, 1.0, j, at=at) for name, j, at in zip("ab", inertia, places, strict=True)]
+    one, two = (m.revolute(m.ground, x, at, axis=axis, name=x.name) for x, at in zip(wheels, places, strict=True))
+    gear, motor = m.coupling(one, two, (0.0, ratio), name="gear"), m.motor(one, torque=2.0)
+    mechanism = m.Mechanism(wheels, [one, two, gear], [motor])
+    solver = dae_jax.OrthogonalProjection(dae_jax.DOP853())
+    sol = dae_jax.daesolve(mechanism.system(), solver, 0.0, 0.1, None, mechanism.assemble())
+    force, moment = mechanism.reaction(sol, "gear")
+    acceleration = 2.0 * ratio**2 / (0.3 * ratio**2 + 0.7)
+    np.testing.assert_allclose(np.ravel(moment[-1])[-1], 0.3 * acceleration - 2.0, rtol=1e-9)
+    np.testing.assert_allclose(force[-1], 0, atol=1e-12)
 
 
 def test_lagrange_s_equations_of_a_body_are_those_of_its_kinetic_energy():

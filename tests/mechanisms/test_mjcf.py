@@ -144,6 +144,18 @@ class TestWelds:
         mechanism = m.read_mjcf(FREE_BODY.format('<weld body1="a" body2="b" anchor=".1 .2 .3"/>'))
         assert mechanism.rank(mechanism.assemble())[1] == 7
 
+    @pytest.mark.parametrize(
+        ("equality", "body"),
+        [
+            ('<weld name="w" body1="b" body2="part"/>', "b"),
+            ('<connect name="w" body1="a" body2="world" anchor="0 0 0"/>', "ground"),
+        ],
+    )
+    def test_between_two_parts_of_one_body_it_is_refused(self, equality, body):
+        text = FREE_BODY.format(equality).replace('pos=".5 0 0"/>', 'pos=".5 0 0"/><body name="part"/>')
+        with pytest.raises(ValueError, match=f"equality 'w', which is between two parts of '{body}'"):
+            m.read_mjcf(text)
+
     def test_with_an_anchor_elsewhere_it_is_refused(self):
         weld = '<weld name="w" body1="a" body2="b" anchor=".1 .2 .3" relpose="1 0 0 1 0 0 0"/>'
         with pytest.raises(ValueError, match="weld 'w', whose relative pose"):
@@ -177,6 +189,7 @@ def test_constraints_that_are_switched_off_are():
     [
         ("<joint ", 'springyield="5" ', "springyield of joint 'g'"),
         ("<joint ", 'armature="1" ', "armature of joint 'g'"),
+        ("<joint ", 'frictionloss="-1" ', "frictionloss of joint 'g'"),
         ('name="b" ', 'gravcomp="1" ', "gravcomp of body 'b'"),
     ],
 )
@@ -195,6 +208,18 @@ def test_fields_of_a_later_version_are_refused_where_they_are_set(monkeypatch):
     monkeypatch.setattr(mjcf, "KNOWN", known)
     with pytest.raises(ValueError, match="stiffness of joint 'hinge'"):
         m.read_mjcf(PENDULUM)
+
+
+@pytest.mark.parametrize("source", [3, None, b"<mujoco/>"])
+def test_what_is_no_file_is_refused(source):
+    with pytest.raises(TypeError, match="`source` must be the path of a file or the text of one, but is"):
+        m.read_mjcf(source)
+
+
+def test_a_joint_that_is_held_is_so_whatever_would_follow_another():
+    held = '</worldbody><equality><joint name="e" joint1="hinge" polycoef="0.3 1 2 0 0"/></equality>'
+    mechanism = m.read_mjcf(PENDULUM.replace("</worldbody>", held))
+    np.testing.assert_allclose(mechanism.joints[-1].coefficients, [0.3])
 
 
 def test_a_pair_in_contact_is_named():

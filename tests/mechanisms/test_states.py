@@ -1,0 +1,124 @@
+"""The rows of a state go with a mechanism's bodies: states of other bodies, or in another order, never pass as its own."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dae_jax
+from dae_jax import mechanisms as m
+
+
+BODIES = [m.Body("light", 1.0, 0.1, at=(0.5, 0)), m.Body("heavy", 50.0, 0.3, at=(1.5, 0))]
+JOINTS = [m.revolute(m.ground, BODIES[0], (0, 0), name="h"), m.revolute(*BODIES, (1, 0), name="k")]
+ONE, OTHER = (m.Mechanism(bodies, JOINTS, [m.gravity((0, -9.81))]) for bodies in (BODIES, BODIES[::-1]))
+NAMED_OTHERWISE = m.Mechanism(
+    [m.Body("arm", 1.0, 0.1)], [m.revolute(m.ground, m.Body("arm", 1.0, 0.1), (0, 0), name="h")]
+)
+
+
+def solved(mechanism: m.Mechanism, y0) -> dae_jax.DAESolution:
+    solver = dae_jax.OrthogonalProjection(dae_jax.DOP853())
+    return dae_jax.daesolve(mechanism.system(), solver, 0.0, 0.1, None, y0, saveat=diffrax.SaveAt(t1=True))
+
+
+def test_a_guess_may_be_a_state_in_another_order():
+    y0 = OTHER.assemble(at={"h": 0.3, "k": -0.2}, rates={"h": 1.0, "k": 2.0})
+    q, v = ONE.assemble(y0)
+    assert q.names == ("light", "heavy")
+    for name in q.names:
+        np.testing.assert_allclose(q[name], y0[0][name], atol=1e-12)
+        np.testing.assert_allclose(v[name], y0[1][name], atol=1e-12)
+
+
+def test_a_guess_may_be_a_state_of_some_of_the_bodies():
+    q, _ = m.Mechanism(BODIES[:1], JOINTS[:1]).assemble(at={"h": 0.3})
+    found, by_name = (ONE.assemble(guess)[0].values for guess in (q, {"light": q["light"]}))
+    np.testing.assert_array_equal(found, by_name)
+
+
+@pytest.mark.parametrize(
+    "take",
+    [
+        lambda q, v: ONE.mass(q),
+        lambda q, v: ONE.force(0.0, q, v, None),
+        lambda q, v: ONE.force(0.0, ONE.reference[0], v, None),
+        lambda q, v: ONE.constraint(0.0, q, None),
+        lambda q, v: ONE.potential(q, None),
+        lambda q, v: ONE.rank((q, v)),
+        lambda q, v: solved(ONE, (q, v)),
+    ],
+    ids="mass force velocities constraint potential rank solve".split(),
+)
+def test_a_state_in_another_order_is_refused(take):
+    with pytest.raises(
+        ValueError, match=r"has the bodies light, heavy, in this order, .* of another mechanism, with heavy, light"
+    ):
+        take(*OTHER.reference)
+
+
+@pytest.mark.parametrize(
+    "show",
+    [
+        lambda sol: ONE.coordinate(sol, "h"),
+        lambda sol: ONE.rate(sol, "h"),
+        lambda sol: ONE.reaction(sol, "h"),
+        lambda sol: ONE.energy(sol),
+    ],
+    ids="coordinate rate reaction energy".split(),
+)
+@pytest.mark.parametrize("mechanism", [OTHER, NAMED_OTHERWISE], ids=["order", "names"])
+def test_a_solution_of_another_mechanism_is_refused(mechanism, show):
+    with pytest.raises(ValueError, match="this one is of another mechanism, with"):
+        show(solved(mechanism, mechanism.reference))
+
+
+TIMES = jnp.linspace(0.0, 0.2, 3)
+DRIVE = m.motor(JOINTS[0], torque=lambda t, c, rate, args: args, name="drive")
+LEAD = m.motor(JOINTS[1], motion=lambda t, args: args * t, name="lead")
+DRIVEN = m.Mechanism(BODIES, [*JOINTS, LEAD], [DRIVE])
+
+
+def driven(torque, saveat):
+    y0, solver = DRIVEN.assemble(args=torque), dae_jax.OrthogonalProjection(dae_jax.DOP853())
+    return dae_jax.daesolve(DRIVEN.system(rank=5), solver, 0.0, 0.2, None, y0, torque, saveat=saveat)
+
+
+def test_of_a_batch_of_solutions_each_is_shown():
+    shown = lambda sol: [
+        DRIVEN.coordinate(sol, "h"),
+        DRIVEN.rate(sol, "h"),
+        DRIVEN.effort(sol, "drive"),
+        DRIVEN.effort(sol, "lead"),
+        *DRIVEN.reaction(sol, "k"),
+        DRIVEN.power(sol),
+    ]
+    torques = jnp.array([1.0, -4.0])
+    solve = lambda torque: driven(torque, diffrax.SaveAt(ts=TIMES))
+    batch = jax.vmap(solve)(torques)
+    each = jax.tree.map(lambda *x: jnp.stack(x), *(shown(solve(torque)) for torque in torques))
+    for found, wanted in zip(jax.tree.leaves(shown(batch)), jax.tree.leaves(each), strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-8)
+    with pytest.raises(ValueError, match=r"takes one solution, but `sol` is a batch: `jax.vmap"):
+        DRIVEN.inverse_dynamics(batch, ["h", "k"])
+
+
+@pytest.mark.parametrize(
+    ("saveat", "said"),
+    [
+        (diffrax.SaveAt(dense=True), r"`sol` must have saved states: `SaveAt\(t1=True\)`"),
+        (diffrax.SaveAt(ts=TIMES, fn=lambda t, y, args: y[0]), r"leave out `SaveAt\(fn=...\)`"),
+    ],
+)
+def test_a_solution_without_states_is_refused(saveat, said):
+    sol = driven(1.0, saveat)
+    for show in (
+        lambda: DRIVEN.coordinate(sol, "h"),
+        lambda: DRIVEN.effort(sol, "lead"),
+        lambda: DRIVEN.reaction(sol, "k"),
+        lambda: DRIVEN.power(sol),
+        lambda: DRIVEN.inverse_dynamics(sol, ["h"]),
+    ):
+        with pytest.raises(ValueError, match=said):
+            show()
