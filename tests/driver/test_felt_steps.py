@@ -97,6 +97,25 @@ def test_with_a_coordinate_without_mass(solver: str) -> None:
     assert abs(jax.jacfwd(end)(0.0) - EXACT) < ALLOWED[solver] * abs(EXACT)
 
 
+@pytest.mark.parametrize("by", [jax.jacfwd, jax.grad], ids=["forwards", "reverse"])
+@pytest.mark.parametrize("rate", [50.0, 1e5])
+@pytest.mark.parametrize("solver", ["RadauIIA5", "BDF", "Radau"])
+def test_by_a_parameter_where_changes_of_the_start_die_down(solver: str, rate: float, by: Any) -> None:
+    """At rest, and pushed by p sin 10 t for p = 0: the solution and a change of its start allow any step."""
+    frequency, end = 10.0, 10.0
+    system = D.SemiExplicitDAE(
+        lambda t, x, z, p: jnp.stack([p * rate * jnp.sin(frequency * t) - z[0], x[0]]),
+        lambda t, x, z, p: z - rate * x[:1],
+    )
+    found = by(
+        lambda p: D.daesolve(system, SOLVERS[solver], 0.0, end, None, (jnp.zeros(2), jnp.zeros(1)), p).ys[0][-1, 1]
+    )
+    turned = frequency * end
+    exact = rate * (1 - np.cos(turned)) / frequency - np.sin(turned) - frequency * np.expm1(-rate * end) / rate
+    exact *= rate / (rate**2 + frequency**2)
+    assert abs(found(0.0) / exact - 1) < 3e-4
+
+
 def test_looser_tolerances_give_as_much() -> None:
     steps = diffrax.PIDController(1e-5, 1e-5)
     found = jax.grad(lambda v: moved(v, "projection", stepsize_controller=steps))(0.0)

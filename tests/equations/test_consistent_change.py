@@ -4,6 +4,7 @@ the search.
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -89,3 +90,33 @@ def test_directions_of_whole_numbers_and_of_another_structure() -> None:
     assert lyapunov(UNIT, solver, *end) == of_floats
     with pytest.raises(ValueError, match="`direction` must hold numbers in the structure of the state"):
         lyapunov(UNIT, solver, *end, direction=jnp.ones(4))
+
+
+def of_args(name: str) -> Any:
+    """A system whose `args` are two lengths, and a state of it that is consistent for (1, 1)."""
+    if name == "mechanism":
+        constraint = lambda t, q, a: (q @ q - (a[0] + t * a[1]) ** 2) / 2
+        return D.ConstrainedSystem(gravity, constraint, mass=jnp.array([1.0, 5.0])), (
+            jnp.array([0.6, -0.8]),
+            jnp.array([0.6, -0.8]),
+        )
+    if name == "knife edge":
+        across = lambda t, q, v, a: a[0] * v[0] * jnp.sin(q[2]) - a[1] * v[1] * jnp.cos(q[2])
+        return D.ConstrainedSystem(gravity, nonholonomic=across), SYSTEMS[name][1]
+    if name == "index 1":
+        return D.ImplicitDAE(lambda t, y, yd, a: [*robertson(t, y, yd, a)[:2], a[0] * y.sum() - a[1]]), SYSTEMS[name][1]
+    long = lambda y, a: y[0] ** 2 + y[1] ** 2 - a[0] * a[1]
+    return D.ImplicitDAE(lambda t, y, yd, a: [*pendulum(t, y, yd, a)[:4], long(y, a)]), SYSTEMS[name][1]
+
+
+@pytest.mark.parametrize("name", ["mechanism", "knife edge", "index 1", "index 3"])
+def test_of_parameters_too(name: str) -> None:
+    """As of the search, where the start follows: of one that is not wanted to move."""
+    system, y = of_args(name)
+    at, change = jnp.ones(2), jnp.array([0.7, -0.4])
+    _, expected = jax.jvp(lambda a: D.consistent_state(system, 0.0, y, a), (at,), (change,))
+    still = jax.tree.map(jnp.zeros_like, y)
+    numbers = jax.tree.map(jnp.zeros_like, eqx.filter(system, eqx.is_inexact_array))
+    found = consistent_change(system, 0.0, y, still, at, (numbers, change))
+    assert jnp.max(jnp.abs(ravel_pytree(expected)[0])) > 0.1
+    np.testing.assert_allclose(ravel_pytree(found)[0], ravel_pytree(expected)[0], rtol=1e-6, atol=1e-6)
