@@ -256,7 +256,8 @@ class Solve:
 
         def way(args: tuple[Arrays], _: Split) -> Steps:
             (arrays,) = jax.lax.stop_gradient(args)
-            return as_kernel(steps)(arrays, some_change(*program.whole(arrays), takes_residuals(self.solver)))
+            solve, problem = program.whole(arrays)
+            return as_kernel(steps)(arrays, some_change(solve, problem, takes_residuals(self.solver)))
 
         return way
 

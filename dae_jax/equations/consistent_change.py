@@ -28,7 +28,7 @@ def consistent_change(system: System, t: Time, y: State, change: State, args: Ar
     """
     numbers, others = eqx.partition((system, args), eqx.is_inexact_array)
 
-    def push(of: Callable[[System, Args], Any]) -> Any:
+    def push(of: Callable[[Any, Args], Any]) -> Any:
         """The change of a function of the system and `args`."""
         if of_numbers is None:
             return 0.0
@@ -52,7 +52,7 @@ def consistent_change(system: System, t: Time, y: State, change: State, args: Ar
 
 
 def _of_mechanism(
-    system: Any, t: Time, y: State, change: State, args: Args, push: Callable[[Callable[[System, Args], Any]], Any]
+    system: Any, t: Time, y: State, change: State, args: Args, push: Callable[[Callable[[Any, Args], Any]], Any]
 ) -> Any:
     """δq with which g, and δv with which (ġ, h) stays 0."""
     ode = MechanicalODE.of(system, t, y, args)

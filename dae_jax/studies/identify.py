@@ -303,7 +303,8 @@ def _refuse_too_few(params: PyTree, data: PyTree, estimated: bool) -> None:
 def _refuse_failure(model: Callable[[Any], Any], params: PyTree, found: Identified, failed: Failed, steps: int) -> None:
     if not (failed.unfinished or failed.peaked):
         return
-    first = jax.jit(model)(params)
+    # A function of its own, as what `model` reads from around it may have changed since JAX has seen it.
+    first = jax.jit(lambda params: model(params))(params)
     for path, leaf in jax.tree_util.tree_leaves_with_path(first):
         _refuse_not_finite("model", path, leaf, AT_THE_START)
     if not np.isfinite(found.cost) or not np.all(np.isfinite(found.information)):
