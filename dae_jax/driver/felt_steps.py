@@ -74,7 +74,8 @@ def some_change(solve: "Solve", problem: Problem, consistent: bool) -> Any:
 
 def _by_no_pattern(tree: PyTree[Array], sizes: Callable[[Array], Array]) -> Any:
     numbers, unflatten = ravel_pytree(tree)
-    return unflatten(sizes(numbers) * jnp.cos(1 + jnp.arange(numbers.size, dtype=numbers.dtype) ** 2))
+    # Parameters may be complex.
+    return unflatten((sizes(numbers) * jnp.cos(1.0 + jnp.arange(numbers.size) ** 2)).astype(numbers.dtype))
 
 
 def by_felt_steps(solved: Callable[[Any], Any], given: Any, change: Any) -> Any:

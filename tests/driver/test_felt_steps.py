@@ -116,6 +116,28 @@ def test_by_a_parameter_where_changes_of_the_start_die_down(solver: str, rate: f
     assert abs(found(0.0) / exact - 1) < 3e-4
 
 
+@pytest.mark.filterwarnings("ignore:Complex dtype support")
+def test_parameters_of_any_kind() -> None:
+    """What can change is of several types of numbers, and what cannot is beside it."""
+    given = {
+        "c": jnp.array(1.0 + 1.0j),
+        "single": jnp.float32(1.0),
+        "count": 3,
+        "which": jnp.arange(3),
+        "name": "decay",
+    }
+    system = D.SemiExplicitDAE(
+        lambda t, x, z, a: -z * a["rate"],
+        lambda t, x, z, a: z - x * jnp.real(a["c"] * jnp.conj(a["c"])) * a["single"].astype(float),
+    )
+
+    def end(rate: Any) -> Any:
+        start = jnp.ones(1), 2 * jnp.ones(1)
+        return D.daesolve(system, D.RadauIIA5(), 0.0, 1.0, None, start, {"rate": rate, **given}).ys[0][-1, 0]
+
+    np.testing.assert_allclose([jax.grad(end)(1.0), jax.jacfwd(end)(1.0)], -2 * np.exp(-2), rtol=1e-6)
+
+
 def test_looser_tolerances_give_as_much() -> None:
     steps = diffrax.PIDController(1e-5, 1e-5)
     found = jax.grad(lambda v: moved(v, "projection", stepsize_controller=steps))(0.0)
