@@ -9,10 +9,9 @@ from pathlib import Path
 
 
 os.environ.setdefault("MPLBACKEND", "Agg")
-# Most of the time of all tests would be LLVM's, for programs that run a few times. Those of the compiler and the notebooks run what
+# A third of the time of all tests would be LLVM's, for programs that run a few times. Those of the compiler and the notebooks run what
 # users run.
 os.environ.setdefault("DAE_JAX_OPTIMISE", "0")
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true")
 
 import jax
 import pytest

@@ -151,6 +151,12 @@ def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[
     return sol.t0, sol.t1, ts["user"], ys["user"], interpolation, stats, result, sol.event_mask, seen, end, ways
 
 
+def steps_of(solve: "Solve", problem: Problem) -> tuple[Steps, Any]:
+    """The steps of a `call` that records them, and how it ended."""
+    *_, result, _, _, _, steps = call(solve, problem)
+    return steps, result
+
+
 def _real(event: diffrax.Event | None, t: Time, y: Y, ode: Equations) -> list[OnStates]:
     """The conditions of an event that cross zero; others become true."""
     conditions = [] if event is None else jax.tree.leaves(event.cond_fn, is_leaf=callable)

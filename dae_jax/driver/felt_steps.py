@@ -6,6 +6,7 @@ derivative's own, relative to its size.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -13,14 +14,17 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from ..compiler import equations
 from ..equations.consistent_change import consistent_change
+from ..solution import RESULTS
 from ..solvers import felt
 from ..systems import is_mechanism
-from ..types import Scalar, Time, Y
+from ..types import IntScalar, Scalar, Time, Y
+from .followed_steps import Steps, as_bits, of_bits, reach
 from .observed_steps import AbstractStepsOf
 from .problem import Problem
 
@@ -54,22 +58,28 @@ def with_changes(solve: "Solve", problem: Problem, given: Any) -> tuple["Solve",
     )
 
 
-def some_change(solve: "Solve", problem: Problem, consistent: bool) -> Any:
-    """A change of all that is `changing`, by no pattern. The start stays `consistent` where this is asked
-    for; nothing changes where no such is found, as with a resistor of 0 Ω: then steps are those of the solution.
+def some_changes(solve: "Solve", problem: Problem, consistent: bool) -> Any:
+    """Two changes of all that is `changing`, by no pattern: of the parameters and the start, and of the start alone. The start stays
+    `consistent` where this is asked for; nothing changes where no such is found: then steps are those of the solution.
     """
     (parameters, start), _ = changing(solve, problem)
-    of_parameters = _by_no_pattern(parameters, lambda x: PARAMETERS * jnp.where(x == 0, 1, jnp.abs(x)))
+    some = _by_no_pattern(parameters, lambda x: PARAMETERS * jnp.where(x == 0, 1, jnp.abs(x)))
+    of_parameters = jax.tree.map(lambda x: jnp.stack([x, jnp.zeros_like(x)]), some)
     change = _by_no_pattern(start, lambda x: 1 + jnp.abs(x))
     if not consistent:
-        return of_parameters, change
+        return of_parameters, jax.tree.map(lambda x: jnp.stack([x, x]), change)
     system, t0, y0, args = problem.start
     # In any metric, where a mass may be 0.
     without_mass = lambda x: eqx.tree_at(lambda x: x.mass, x, None, is_leaf=lambda x: x is None)
     metric = without_mass if is_mechanism(system) else lambda x: x
-    change = consistent_change(metric(system), t0, y0, change, args, (metric(of_parameters[1]), of_parameters[2]))
-    found = jnp.all(jnp.isfinite(ravel_pytree(change)[0]))
-    return jax.tree.map(lambda x: jnp.where(found, x, 0), (of_parameters, change))
+
+    @functools.partial(jax.vmap, axis_size=2)
+    def changes(of_parameters: Any) -> Any:
+        along = consistent_change(metric(system), t0, y0, change, args, (metric(of_parameters[1]), of_parameters[2]))
+        found = jnp.all(jnp.isfinite(ravel_pytree(along)[0]))
+        return jax.tree.map(lambda x: jnp.where(found, x, 0), (of_parameters, along))
+
+    return changes(of_parameters)
 
 
 def _by_no_pattern(tree: PyTree[Array], sizes: Callable[[Array], Array]) -> Any:
@@ -78,13 +88,23 @@ def _by_no_pattern(tree: PyTree[Array], sizes: Callable[[Array], Array]) -> Any:
     return unflatten((sizes(numbers) * jnp.cos(1.0 + jnp.arange(numbers.size) ** 2)).astype(numbers.dtype))
 
 
-def by_felt_steps(solved: Callable[[Any], Any], given: Any, change: Any) -> Any:
-    """What a solve with `felt_steps` gives for what is `changing`, by steps that are short enough for what a change of it grows into.
-    Where a function of the user has a derivative in reverse only, a rule of its own, they are those of the solution.
+def by_felt_steps(solved: Callable[[Any], tuple[Steps, Any]], given: Any, changes: Any) -> Steps:
+    """The steps of a solve with `felt_steps`, short enough for what the first of `changes` grows into, or else the second: where the index
+    of the equations is another one for a parameter beside the given one, as for a resistor of 0 Ω, a change of it allows none. NaN where
+    neither leads to the end. Where a function of the user has a derivative in reverse only, a rule of its own, they are those of the
+    solution.
     """
-    if any(eqn.primitive.name.startswith("custom_vjp") for eqn in equations(jax.make_jaxpr(solved)(given))):
-        return solved(given)
-    return jax.jvp(solved, (given,), (change,))[0]
+    one_way = any(eqn.primitive.name.startswith("custom_vjp") for eqn in equations(jax.make_jaxpr(solved)(given)))
+
+    def attempt(k: IntScalar) -> Steps:
+        change = jax.tree.map(lambda x: lax.dynamic_index_in_dim(x, k, keepdims=False), changes)
+        steps, result = solved(given) if one_way else jax.jvp(solved, (given,), (change,))[0]
+        ended = (result == RESULTS.successful) | (result == RESULTS.event_occurred)
+        return as_bits(steps._replace(times=jnp.where(ended, steps.times, jnp.nan)))
+
+    none = jax.tree.map(lambda x: jnp.full(x.shape, -1, x.dtype), jax.eval_shape(attempt, jnp.asarray(0)))
+    again = lambda carry: (carry[0] + 1, attempt(carry[0]))
+    return lax.while_loop(lambda carry: (carry[0] < 2) & ~reach(of_bits(carry[1])), again, (jnp.asarray(0), none))[1]
 
 
 def felt_steps(controller: diffrax.AbstractAdaptiveStepSizeController, smallest: Scalar) -> Any:

@@ -12,10 +12,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int, Int8
+from jaxtyping import Array, Float, Int, Int8, PyTree
 
 from ..equations.manifold_ode import Equations
-from ..types import IntScalar, Scalar, Y
+from ..types import BoolScalar, IntScalar, Scalar, Y
 from .observed_steps import AbstractStepsOf, Step
 
 
@@ -64,6 +64,19 @@ def of_bits(steps: Steps) -> Steps:
     """The times as numbers again."""
     kind = jnp.float64 if steps.times.dtype == jnp.int64 else jnp.float32
     return steps._replace(times=lax.bitcast_convert_type(steps.times, kind))
+
+
+def reach(steps: Steps) -> BoolScalar:
+    """Whether they lead to the end: else their times are NaN."""
+    return ~jnp.isnan(steps.times[0])
+
+
+def if_reached(tree: PyTree, steps: Steps | None) -> Any:
+    """The numbers of a derivative, or NaN where its steps do not lead to the end."""
+    if steps is None:
+        return tree
+    factor = jnp.where(reach(steps), 1.0, jnp.nan)
+    return jax.tree.map(lambda x: x * factor.astype(x.dtype) if eqx.is_inexact_array(x) else x, tree)
 
 
 class _Followed(NamedTuple):

@@ -24,11 +24,11 @@ from ..solvers import AbstractManifoldSolver, economical, replays, takes_residua
 from ..types import Scalar, State
 from ..validate.captured import settled
 from ..validate.user_functions import refuse_wrong_functions, returned
-from .diffrax_call import Decode, View, call
+from .diffrax_call import Decode, View, call, steps_of
 from .ends import look
 from .event_functions import known_to_conditions, refuse_wrong_event
-from .felt_steps import OneDirection, by_felt_steps, changing, some_change, with_changes
-from .followed_steps import Steps, as_bits, of_bits
+from .felt_steps import OneDirection, by_felt_steps, changing, some_changes, with_changes
+from .followed_steps import Steps, as_bits, if_reached, of_bits
 from .outcome import judged
 from .problem import Problem, Program, split
 from .resets import Reset, solve_with_resets
@@ -73,7 +73,8 @@ def _numbers(program: Program, arrays: Arrays, steps: Steps | None = None) -> Sp
     """diffrax's part of a solve; jitted, so that derivatives and batches of it find it traced."""
     solve, problem = program.whole(arrays)
     with settled(program.leaves):
-        return Split.of(call(solve, problem, None if steps is None else of_bits(steps)))
+        at = None if steps is None else of_bits(steps)
+        return if_reached(Split.of(call(solve, problem, at)), at)
 
 
 def _refuse_reverse(*_: object) -> Any:
@@ -133,8 +134,7 @@ class Solve:
         check, check_arrays = self._check(problem, end)
         # A yes or no has no derivative.
         found = one_kernel(check, self.derivative())(jax.lax.stop_gradient(check_arrays))
-        (_, as_expected), *_ = found
-        return judged(self, fields, problem, found, end), as_expected
+        return judged(self, fields, problem, found, end), found[0][1]
 
     def keeps(self) -> tuple[bool, bool]:
         """Whether g and (ġ, h) hold at each step."""
@@ -152,9 +152,7 @@ class Solve:
         return self.formulation.encode(independent(*problem.start, problem.rank, problem.rows), *start)
 
     def refuse_wrong_functions(self, problem: Problem) -> None:
-        """Refuses functions of the user that do not take or return what they must, and a system that the method is not for,
-        in a sentence.
-        """
+        """Refuses, in a sentence, functions that do not take or return what they must, and a system that the method is not for."""
         system, *start = problem.start
         refuse_wrong_functions(system, *start)
         self.formulation.refuse(system)
@@ -231,7 +229,8 @@ class Solve:
                 of_t1 = of_t1 + of_stats["end_time"]
                 tape = ts["tape"], ys["tape"], None if interpolation is None else interpolation.path.infos
                 of_taped = cotangents(eqx.combine(found, Taped(*fixed)), fixed_steps, tape, of_ys)
-                return inexact(through_encoding(saved_times(of_taped, self.saveat.subs, of_t0, of_t1, of_ts))[0])
+                (of_arrays,) = through_encoding(saved_times(of_taped, self.saveat.subs, of_t0, of_t1, of_ts))
+                return inexact(if_reached(of_arrays, of_bits(*steps) if steps else None))
 
         return pull_back
 
@@ -246,18 +245,18 @@ class Solve:
         saveat = diffrax.SaveAt(subs=diffrax.SubSaveAt(t1=True, fn=as_it_is))
         program, _ = split((self, problem))
 
-        def steps(arrays: Arrays, change: Any) -> Steps:
+        def steps(arrays: Arrays, changes: Any) -> Steps:
             with settled(program.leaves):
                 solve, problem = program.whole(arrays)
-                solve = dataclasses.replace(solve, adjoint=OneDirection(), saveat=saveat)
                 given, rest = changing(solve, problem)
-                solved = lambda given: call(*with_changes(solve, problem, eqx.combine(given, rest)))[-1]
-                return as_bits(by_felt_steps(solved, given, change))
+                solve = dataclasses.replace(solve, adjoint=OneDirection(), saveat=saveat)
+                solved = lambda given: steps_of(*with_changes(solve, problem, eqx.combine(given, rest)))
+                return by_felt_steps(solved, given, changes)
 
         def way(args: tuple[Arrays], _: Split) -> Steps:
             (arrays,) = jax.lax.stop_gradient(args)
             solve, problem = program.whole(arrays)
-            return as_kernel(steps)(arrays, some_change(solve, problem, takes_residuals(self.solver)))
+            return as_kernel(steps)(arrays, some_changes(solve, problem, takes_residuals(self.solver)))
 
         return way
 

@@ -177,3 +177,11 @@ def test_a_lyapunov_exponent_at_the_highest_point(solver: Any) -> None:
     along = jnp.array([1.0, 0.0]), jnp.array([FREQUENCY, 0.0])
     found = reductions.lyapunov(PENDULUM, solver, 0.0, 3.0, start, GRAVITY, direction=along)
     assert abs(found - FREQUENCY) < 1e-5
+
+
+@pytest.mark.parametrize("by", [jax.jacfwd, jax.grad], ids=["forwards", "reverse"])
+@pytest.mark.parametrize("solver", ["projection", "BDF"])
+def test_too_few_steps_for_a_derivative_are_nan(solver: str, by: Any) -> None:
+    """As many as the solution needs do not lead a derivative to the end: what it was on the way is not handed out."""
+    assert moved(jnp.zeros(()), solver, max_steps=20) == 0
+    assert jnp.isnan(by(lambda v: moved(v, solver, max_steps=20))(0.0))

@@ -69,7 +69,8 @@ def _is_own(found: os.stat_result) -> bool:
 
 
 def _make_room(folder: Path) -> None:
-    files = [(found.stat(), found.path) for found in os.scandir(folder)]
+    with os.scandir(folder) as entries:
+        files = [(found.stat(), found.path) for found in entries]
     total = sum(found.st_size for found, _ in files)
     for found, path in sorted(files, key=lambda item: item[0].st_mtime):
         if total <= BOUND:
