@@ -25,7 +25,7 @@ from ..solvers import (
     first_step,
     takes_residuals,
 )
-from ..types import Time, Y
+from ..types import BoolScalar, Time, Y
 from .bracket import bracketing
 from .crossings import OneCrossing, OnStates
 from .event_functions import known_to_conditions
@@ -151,10 +151,12 @@ def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[
     return sol.t0, sol.t1, ts["user"], ys["user"], interpolation, stats, result, sol.event_mask, seen, end, ways
 
 
-def steps_of(solve: "Solve", problem: Problem) -> tuple[Steps, Any]:
-    """The steps of a `call` that records them, and how it ended."""
-    *_, result, _, _, _, steps = call(solve, problem)
-    return steps, result
+def steps_of(solve: "Solve", problem: Problem) -> tuple[Steps, BoolScalar]:
+    """The steps of a `call` that records them, and whether they lead to its end. Its code would keep alive what no kernel can have."""
+    *_, event_mask, _, _, steps = call(solve, problem)
+    last = jnp.max(jnp.where(jnp.isfinite(steps.times), steps.times, -jnp.inf))
+    at_end = last >= jnp.where(problem.t1 < problem.t0, -problem.t1, problem.t1)
+    return steps, jnp.any(jnp.stack([at_end, *jax.tree.leaves(event_mask)]))
 
 
 def _real(event: diffrax.Event | None, t: Time, y: Y, ode: Equations) -> list[OnStates]:

@@ -19,11 +19,11 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from ..compiler import equations
+from ..compiler.jaxprs.unchecked import without_checks
 from ..equations.consistent_change import consistent_change
-from ..solution import RESULTS
 from ..solvers import felt
 from ..systems import is_mechanism
-from ..types import IntScalar, Scalar, Time, Y
+from ..types import BoolScalar, IntScalar, Scalar, Time, Y
 from .followed_steps import Steps, as_bits, of_bits, reach
 from .observed_steps import AbstractStepsOf
 from .problem import Problem
@@ -88,22 +88,26 @@ def _by_no_pattern(tree: PyTree[Array], sizes: Callable[[Array], Array]) -> Any:
     return unflatten((sizes(numbers) * jnp.cos(1.0 + jnp.arange(numbers.size) ** 2)).astype(numbers.dtype))
 
 
-def by_felt_steps(solved: Callable[[Any], tuple[Steps, Any]], given: Any, changes: Any) -> Steps:
+def by_felt_steps(solved: Callable[[Any], tuple[Steps, BoolScalar]], given: Any, changes: Any) -> Steps:
     """The steps of a solve with `felt_steps`, short enough for what the first of `changes` grows into, or else the second: where the index
     of the equations is another one for a parameter beside the given one, as for a resistor of 0 Ω, a change of it allows none. NaN where
     neither leads to the end. Where a function of the user has a derivative in reverse only, a rule of its own, they are those of the
     solution.
     """
-    one_way = any(eqn.primitive.name.startswith("custom_vjp") for eqn in equations(jax.make_jaxpr(solved)(given)))
+    jaxpr, (shapes, _) = jax.make_jaxpr(solved, return_shape=True)(given)
+    one_way = any(eqn.primitive.name.startswith("custom_vjp") for eqn in equations(jaxpr))
 
-    def attempt(k: IntScalar) -> Steps:
-        change = jax.tree.map(lambda x: lax.dynamic_index_in_dim(x, k, keepdims=False), changes)
-        steps, result = solved(given) if one_way else jax.jvp(solved, (given,), (change,))[0]
-        ended = (result == RESULTS.successful) | (result == RESULTS.event_occurred)
-        return as_bits(steps._replace(times=jnp.where(ended, steps.times, jnp.nan)))
+    # What is refused the solution refuses, too; in a loop it could not become part of a kernel.
+    @without_checks
+    def attempt(change: Any) -> tuple[Steps, BoolScalar]:
+        return solved(given) if one_way else jax.jvp(solved, (given,), (change,))[0]
 
-    none = jax.tree.map(lambda x: jnp.full(x.shape, -1, x.dtype), jax.eval_shape(attempt, jnp.asarray(0)))
-    again = lambda carry: (carry[0] + 1, attempt(carry[0]))
+    def again(carry: tuple[IntScalar, Steps]) -> tuple[IntScalar, Steps]:
+        k, _ = carry
+        steps, ended = attempt(jax.tree.map(lambda x: lax.dynamic_index_in_dim(x, k, keepdims=False), changes))
+        return k + 1, as_bits(steps._replace(times=jnp.where(ended, steps.times, jnp.nan)))
+
+    none = as_bits(jax.tree.map(lambda x: jnp.full(x.shape, jnp.nan).astype(x.dtype), shapes))
     return lax.while_loop(lambda carry: (carry[0] < 2) & ~reach(of_bits(carry[1])), again, (jnp.asarray(0), none))[1]
 
 
