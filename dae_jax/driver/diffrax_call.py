@@ -156,7 +156,7 @@ def steps_of(solve: "Solve", problem: Problem) -> tuple[Steps, BoolScalar]:
     *_, event_mask, _, _, steps = call(solve, problem)
     last = jnp.max(jnp.where(jnp.isfinite(steps.times), steps.times, -jnp.inf))
     at_end = last >= jnp.where(problem.t1 < problem.t0, -problem.t1, problem.t1)
-    return steps, jnp.any(jnp.stack([at_end, *jax.tree.leaves(event_mask)]))
+    return steps, jnp.any(jnp.stack([problem.t0 == problem.t1, at_end, *jax.tree.leaves(event_mask)]))
 
 
 def _real(event: diffrax.Event | None, t: Time, y: Y, ode: Equations) -> list[OnStates]:
