@@ -16,7 +16,7 @@ from .._compat import use_stepsize_tol
 from ..equations.manifold_ode import Equations, ManifoldODE
 from ..formulations import AbstractFormulation
 from ..linalg import error_norm
-from ..solution import RESULTS, Interpolation
+from ..solution import RESULTS, Interpolation, Split
 from ..solvers import (
     AbstractManifoldSolver,
     WithoutFailedSteps,
@@ -151,12 +151,18 @@ def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[
     return sol.t0, sol.t1, ts["user"], ys["user"], interpolation, stats, result, sol.event_mask, seen, end, ways
 
 
-def steps_of(solve: "Solve", problem: Problem) -> tuple[Steps, BoolScalar]:
-    """The steps of a `call` that records them, and whether they lead to its end. Its code would keep alive what no kernel can have."""
+def failed(out: Split, problem: Problem) -> BoolScalar:
+    """Whether what a `call` has given ended on its way, without an event."""
+    *_, stats, _, event_mask, _, _, _ = out.numbers
+    return ~jnp.any(jnp.stack([stats["end_time"] == problem.t1, *jax.tree.leaves(event_mask)]))
+
+
+def steps_of(solve: "Solve", problem: Problem, failed: BoolScalar) -> tuple[Steps, BoolScalar]:
+    """The steps of a `call` that records them, and whether they lead to its end, or the solution itself has `failed`."""
     *_, event_mask, _, _, steps = call(solve, problem)
     last = jnp.max(jnp.where(jnp.isfinite(steps.times), steps.times, -jnp.inf))
     at_end = last >= jnp.where(problem.t1 < problem.t0, -problem.t1, problem.t1)
-    return steps, jnp.any(jnp.stack([problem.t0 == problem.t1, at_end, *jax.tree.leaves(event_mask)]))
+    return steps, jnp.any(jnp.stack([failed, problem.t0 == problem.t1, at_end, *jax.tree.leaves(event_mask)]))
 
 
 def _real(event: diffrax.Event | None, t: Time, y: Y, ode: Equations) -> list[OnStates]:

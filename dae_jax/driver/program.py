@@ -21,10 +21,10 @@ from ..equations.residual_form import LARGE
 from ..formulations import AbstractFormulation
 from ..solution import DAESolution, Split
 from ..solvers import AbstractManifoldSolver, economical, replays, takes_residuals
-from ..types import Scalar, State
+from ..types import BoolScalar, Scalar, State
 from ..validate.captured import settled
 from ..validate.user_functions import refuse_wrong_functions, returned
-from .diffrax_call import Decode, View, call, steps_of
+from .diffrax_call import Decode, View, call, failed, steps_of
 from .ends import look
 from .event_functions import known_to_conditions, refuse_wrong_event
 from .felt_steps import OneDirection, by_felt_steps, changing, some_changes, with_changes
@@ -245,18 +245,20 @@ class Solve:
         saveat = diffrax.SaveAt(subs=diffrax.SubSaveAt(t1=True, fn=as_it_is))
         program, _ = split((self, problem))
 
-        def steps(arrays: Arrays, changes: Any) -> Steps:
+        def steps(arrays: Arrays, changes: Any, failed: BoolScalar) -> Steps:
             with settled(program.leaves):
                 solve, problem = program.whole(arrays)
                 given, rest = changing(solve, problem)
                 solve = dataclasses.replace(solve, adjoint=OneDirection(), saveat=saveat)
-                solved = lambda given: steps_of(*with_changes(solve, problem, eqx.combine(given, rest)))
+                solved = lambda given: steps_of(*with_changes(solve, problem, eqx.combine(given, rest)), failed)
                 return by_felt_steps(solved, given, changes)
 
-        def way(args: tuple[Arrays], _: Split) -> Steps:
+        def way(args: tuple[Arrays], out: Split) -> Steps:
             (arrays,) = jax.lax.stop_gradient(args)
             solve, problem = program.whole(arrays)
-            return as_kernel(steps)(arrays, some_changes(solve, problem, takes_residuals(self.solver)))
+            return as_kernel(steps)(
+                arrays, some_changes(solve, problem, takes_residuals(self.solver)), failed(out, problem)
+            )
 
         return way
 
