@@ -93,11 +93,11 @@ def daesolve(
       at a time that depends on what is differentiated, they lack that dependence, as the derivative of `where` does: a `Reset` has
       it. Steps of a derivative are its own, with an error of up to ten tolerances relative to its largest entry, of changes of the
       start and of a hundredth of all parameters together: about an equilibrium the solution itself allows any step. `max_steps`
-      holds for them too; beyond, the derivative is NaN. They are those of the solution, and may leap over what the derivative needs
-      (give `dtmax` of the controller), with `adjoint=DirectAdjoint()`, without one kernel, with `SaveAt(dense=True)` or
-      `steps=True`, with `max_steps=None` or many unknowns, and through a `custom_vjp`. Second derivatives are there in any order of
-      modes, third ones with `jax.jacfwd` outside; with a progress meter or without one kernel forward-mode derivatives need
-      `adjoint=diffrax.ForwardMode()`.
+      holds for them too; beyond, the derivative is NaN, after solvers of residuals have tried steps for changes of the start alone.
+      They are those of the solution, and may leap over what the derivative needs (give `dtmax` of the controller), with
+      `adjoint=DirectAdjoint()`, without one kernel, with `SaveAt(dense=True)` or `steps=True`, with `max_steps=None` or many
+      unknowns, and through a `custom_vjp`. Second derivatives are there in any order of modes, third ones with `jax.jacfwd`
+      outside; with a progress meter or without one kernel forward-mode derivatives need `adjoint=diffrax.ForwardMode()`.
 
     **Returns** a `DAESolution`.
 

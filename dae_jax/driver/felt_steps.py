@@ -59,15 +59,14 @@ def with_changes(solve: "Solve", problem: Problem, given: Any) -> tuple["Solve",
 
 
 def some_changes(solve: "Solve", problem: Problem, consistent: bool) -> Any:
-    """Two changes of all that is `changing`, by no pattern: of the parameters and the start, and of the start alone. The start stays
-    `consistent` where this is asked for; nothing changes where no such is found: then steps are those of the solution.
+    """A change of all that is `changing`, by no pattern, and, where the start must stay `consistent` and parameters may change the index,
+    one of the start alone. Nothing changes where no such is found: then steps are those of the solution.
     """
     (parameters, start), _ = changing(solve, problem)
-    some = _by_no_pattern(parameters, lambda x: PARAMETERS * jnp.where(x == 0, 1, jnp.abs(x)))
-    of_parameters = jax.tree.map(lambda x: jnp.stack([x, jnp.zeros_like(x)]), some)
+    of_parameters = _by_no_pattern(parameters, lambda x: PARAMETERS * jnp.where(x == 0, 1, jnp.abs(x)))
     change = _by_no_pattern(start, lambda x: 1 + jnp.abs(x))
     if not consistent:
-        return of_parameters, jax.tree.map(lambda x: jnp.stack([x, x]), change)
+        return jax.tree.map(lambda x: x[None], (of_parameters, change))
     system, t0, y0, args = problem.start
     # In any metric, where a mass may be 0.
     without_mass = lambda x: eqx.tree_at(lambda x: x.mass, x, None, is_leaf=lambda x: x is None)
@@ -79,7 +78,7 @@ def some_changes(solve: "Solve", problem: Problem, consistent: bool) -> Any:
         found = jnp.all(jnp.isfinite(ravel_pytree(along)[0]))
         return jax.tree.map(lambda x: jnp.where(found, x, 0), (of_parameters, along))
 
-    return changes(of_parameters)
+    return changes(jax.tree.map(lambda x: jnp.stack([x, jnp.zeros_like(x)]), of_parameters))
 
 
 def _by_no_pattern(tree: PyTree[Array], sizes: Callable[[Array], Array]) -> Any:
@@ -89,9 +88,9 @@ def _by_no_pattern(tree: PyTree[Array], sizes: Callable[[Array], Array]) -> Any:
 
 
 def by_felt_steps(solved: Callable[[Any], tuple[Steps, BoolScalar]], given: Any, changes: Any) -> Steps:
-    """The steps of a solve with `felt_steps`, short enough for what the first of `changes` grows into, or else the second: where the index
+    """The steps of a solve with `felt_steps`, short enough for what the first of `changes` grows into, or else the next: where the index
     of the equations is another one for a parameter beside the given one, as for a resistor of 0 Ω, a change of it allows none. NaN where
-    neither leads to the end. Where a function of the user has a derivative in reverse only, a rule of its own, they are those of the
+    none leads to the end. Where a function of the user has a derivative in reverse only, a rule of its own, they are those of the
     solution.
     """
     jaxpr, (shapes, _) = jax.make_jaxpr(solved, return_shape=True)(given)
@@ -107,8 +106,9 @@ def by_felt_steps(solved: Callable[[Any], tuple[Steps, BoolScalar]], given: Any,
         steps, ended = attempt(jax.tree.map(lambda x: lax.dynamic_index_in_dim(x, k, keepdims=False), changes))
         return k + 1, as_bits(steps._replace(times=jnp.where(ended, steps.times, jnp.nan)))
 
+    most = len(jax.tree.leaves(changes)[0])
     none = as_bits(jax.tree.map(lambda x: jnp.full(x.shape, jnp.nan).astype(x.dtype), shapes))
-    return lax.while_loop(lambda carry: (carry[0] < 2) & ~reach(of_bits(carry[1])), again, (jnp.asarray(0), none))[1]
+    return lax.while_loop(lambda carry: (carry[0] < most) & ~reach(of_bits(carry[1])), again, (jnp.asarray(0), none))[1]
 
 
 def felt_steps(controller: diffrax.AbstractAdaptiveStepSizeController, smallest: Scalar) -> Any:
