@@ -139,5 +139,6 @@ class FeltSteps(AbstractStepsOf):
         error_order: Any,
         controller_state: Any,
     ) -> Any:
-        error = None if y_error is None else felt(y_error, y0, y1_candidate, t1 - t0 >= self.smallest)
+        counts = t1 - t0 >= self.smallest
+        error = None if y_error is None else felt(y_error, y0, y1_candidate, counts, self.rtol, self.atol)
         return self.steps.adapt_step_size(t0, t1, y0, y1_candidate, args, error, error_order, controller_state)

@@ -225,7 +225,7 @@ class BDF(Replayable, AbstractResidualSolver):
         change, phi = _differences(y1 - step.y, star, k)
 
         scale = args.weights(h) * args.counted(self.dense) / tol.scale(y0, y1)
-        seen = lambda row: row if args.felt is None else felt(row, y0, y1, h >= args.felt)
+        seen = lambda row: row if args.felt is None else felt(row, y0, y1, h >= args.felt, tol.rtol, tol.atol)
         size = lambda row: rms_norm(constant(seen(row) * scale))
         sizes = [size(row) for row in phi]
         higher = size(change - _at(star, k + 1))

@@ -147,7 +147,9 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
         y1 = y0 + z[-1]
         counted = error_of_step(*constant((step, factors.real, z, state)), tol=tol, dense=self.dense)
         if args.felt is not None:
-            seen = constant(felt(embedded(step, constant(factors.real), z, tol)[1], y0, y1, step.h >= args.felt))
+            seen = constant(
+                felt(embedded(step, constant(factors.real), z, tol)[1], y0, y1, step.h >= args.felt, tol.rtol, tol.atol)
+            )
             counted = jnp.where(jnp.abs(seen) > jnp.abs(counted), seen, counted)
         rates, smallest = step.stages(z)[-1][2], step.smallest
         # What is algebraic may jump in the smallest step.
