@@ -7,8 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.integrate
 
 import dae_jax as D
+from dae_jax.scenes import SCENES
 from dae_jax.studies import reductions
 
 
@@ -114,6 +116,39 @@ def test_by_a_parameter_where_changes_of_the_start_die_down(solver: str, rate: f
     exact = rate * (1 - np.cos(turned)) / frequency - np.sin(turned) - frequency * np.expm1(-rate * end) / rate
     exact *= rate / (rate**2 + frequency**2)
     assert abs(found(0.0) / exact - 1) < 3e-4
+
+
+@pytest.mark.parametrize("solver", ["RadauIIA5", "BDF"])
+def test_small_variables_have_an_absolute_tolerance_of_their_own(solver: str) -> None:
+    """Robertson's to 1e11: with an absolute tolerance of 1e-14 a derivative takes no more steps than it may."""
+    scene, end = SCENES["robertson"](), 1e11
+    tolerances = diffrax.PIDController(rtol=1e-8, atol=1e-14)
+
+    def states(start: Any) -> Any:
+        y0 = jnp.stack([start, 0 * start]), 1 - jnp.stack([start])
+        return D.daesolve(scene.system, SOLVERS[solver], 0.0, end, None, y0, stepsize_controller=tolerances).final[0]
+
+    found = jax.jvp(states, (jnp.ones(()),), (jnp.ones(()),))[1]
+    assert np.allclose(found, _robertson_by_start(end), rtol=1e-4, atol=0)
+
+
+def _robertson_by_start(end: float) -> Any:
+    """The derivative of (y₁, y₂) by y₁(0) along which the sum of all is 1, by scipy's Radau of the linearised ODE beside it."""
+    slope = lambda y: np.array(
+        [
+            [-0.04 - 1e4 * y[1], 1e4 * (1 - y[0] - 2 * y[1])],
+            [0.04 + 1e4 * y[1], -1e4 * (1 - y[0] - 2 * y[1]) - 6e7 * y[1]],
+        ]
+    )
+
+    def field(_: float, both: Any) -> Any:
+        y, change = both[:2], both[2:]
+        z = 1 - y[0] - y[1]
+        slow, fast = 0.04 * y[0] - 1e4 * y[1] * z, 3e7 * y[1] ** 2
+        return np.concatenate([[-slow, slow - fast], slope(y) @ change])
+
+    solved = scipy.integrate.solve_ivp(field, (0, end), [1, 0, 1, 0], "Radau", rtol=1e-9, atol=1e-30)
+    return solved.y[2:, -1]
 
 
 @pytest.mark.filterwarnings("ignore:Complex dtype support")
