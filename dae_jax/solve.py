@@ -93,8 +93,9 @@ def daesolve(
       at a time that depends on what is differentiated, they lack that dependence, as the derivative of `where` does: a `Reset` has
       it. Steps of a derivative are its own, with an error of up to ten tolerances relative to its largest entry, of changes of the
       start and of a hundredth of all parameters together: about an equilibrium the solution itself allows any step. `max_steps`
-      holds for them too; beyond, the derivative is NaN, after solvers of residuals have tried steps for changes of the start alone.
-      They are those of the solution, and may leap over what the derivative needs (give `dtmax` of the controller), with
+      holds for them too, beyond which it is an error to ask for the derivative (with `throw=False` it is NaN), after solvers of residuals
+      have tried steps for changes of the start alone. They are those of the solution, and may leap over what the derivative needs
+      (give `dtmax` of the controller), with
       `adjoint=DirectAdjoint()`, without one kernel, with `SaveAt(dense=True)` or `steps=True`, with `max_steps=None` or many
       unknowns, and through a `custom_vjp`. Second derivatives are there in any order of modes, third ones with `jax.jacfwd`
       outside; with a progress meter or without one kernel forward-mode derivatives need `adjoint=diffrax.ForwardMode()`.
@@ -110,7 +111,7 @@ def daesolve(
     """
     solve, problem = prepared(
         with_rates(system, yd0, y0), solver, t0, t1, dt0, y0, args, formulation, saveat, stepsize_controller, adjoint, event,
-        max_steps, progress_meter,
+        max_steps, progress_meter, throw,
     )  # fmt: skip
     refuse_bad_times(solve.saveat, problem.t0, problem.t1)
     program, arrays = split((solve, problem))
@@ -142,6 +143,7 @@ def prepared(
     event: diffrax.Event | Reset | None,
     max_steps: int | None,
     progress_meter: ProgressMeter,
+    throw: bool = False,
 ) -> tuple[Solve, Problem]:
     """The method and the problem of a solve, checked, with the defaults filled in."""
     y0, args = checked(system, t0, t1, dt0, y0, args)
@@ -175,7 +177,7 @@ def prepared(
         refuse_no_event(solver)
     if isinstance(event, Reset):
         refuse_other_outputs(saveat)
-    solve = Solve(formulation, solver, saveat, controller, adjoint, event, progress_meter, max_steps)
+    solve = Solve(formulation, solver, saveat, controller, adjoint, event, progress_meter, max_steps, throw)
     return solve, Problem(system, start, end, step, y0, args, getattr(system, "rank", None))
 
 

@@ -27,6 +27,7 @@ from ..solvers.residual_steps import constant
 from ..systems import is_mechanism
 from ..types import BoolScalar
 from ..validate.user_functions import not_finite
+from .followed_steps import Steps, of_bits, reach
 from .problem import Problem, Program, split
 from .start import ADVICE
 
@@ -50,7 +51,9 @@ BEYOND = (0.0, 1e-9, 1e-6, 1e-3)
 
 
 class SolveFailed(RuntimeError):
-    """A solve failed in a compiled program (`jit`, `vmap`). JAX hands it on as the last line of an error of its own."""
+    """A solve failed in a compiled program (`jit`, `vmap`), or the derivative of one. JAX hands it on as the last line of an error of its
+    own.
+    """
 
 
 def in_words(sol: DAESolution, problem: Problem | None = None) -> str | None:
@@ -180,6 +183,21 @@ def _passed(
 def _(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
     one = _passed(jnp.ones(()), *primals[1:])
     return _passed(*primals), jax.tree.map(lambda tangent: tangent * one.astype(tangent.dtype), tangents[0])
+
+
+def refused_on_the_way(steps: Steps, most: int) -> Steps:
+    """The steps of a derivative, at most so many, in a program in which it raises a `SolveFailed` where they do not lead to the end."""
+    fail = lambda: jax.pure_callback(functools.partial(_raise_of_derivative, most), jnp.zeros((), int))
+    none = lax.cond(unvmap_any(~reach(of_bits(steps))), fail, lambda: jnp.zeros((), int))
+    return steps._replace(times=steps.times.at[0].add(none.astype(steps.times.dtype)))
+
+
+def _raise_of_derivative(most: int) -> Any:
+    logging.getLogger(CALLBACK_LOG).addFilter(_without_ours)
+    raise SolveFailed(
+        f"The derivative of a solve is not known: its steps, which are shorter than those of the solution where it needs that, do not "
+        f"lead to the end. Raise `max_steps`, which is {most}. With `throw=False` the derivative is NaN instead."
+    )
 
 
 def _off(program: Program, numbers: list[Array]) -> Violation | None:

@@ -27,6 +27,7 @@ from ..validate.user_functions import refuse_wrong_functions, returned
 from .diffrax_call import Decode, View, call, failed, steps_of
 from .ends import look
 from .event_functions import known_to_conditions, refuse_wrong_event
+from .failures import refused_on_the_way
 from .felt_steps import OneDirection, by_felt_steps, changing, some_changes, with_changes
 from .followed_steps import Steps, as_bits, if_reached, of_bits
 from .outcome import judged
@@ -105,7 +106,7 @@ def run(program: Program, arrays: Arrays) -> tuple[DAESolution, Any, float]:
 @functools.partial(
     jax.tree_util.register_dataclass,
     data_fields=("formulation", "solver", "saveat", "controller", "adjoint", "event", "progress_meter"),
-    meta_fields=("max_steps", "recording"),
+    meta_fields=("max_steps", "throw", "recording"),
 )
 @dataclasses.dataclass(frozen=True, eq=False)
 class Solve:
@@ -119,6 +120,8 @@ class Solve:
     event: diffrax.Event | Reset | None
     progress_meter: diffrax.AbstractProgressMeter
     max_steps: int | None
+    # Whether a derivative that is not known is an error.
+    throw: bool = False
     # Whether the dense output is there for the tape alone.
     recording: bool = False
 
@@ -240,7 +243,8 @@ class Solve:
         """
         adaptive = isinstance(self.controller, diffrax.AbstractAdaptiveStepSizeController)
         size = sum(leaf.size for leaf in jax.tree.leaves(problem.y0))
-        if not (adaptive and self.has_derivative_apart()) or self.max_steps is None or size > LARGE:
+        most = self.max_steps
+        if not (adaptive and self.has_derivative_apart()) or most is None or size > LARGE:
             return None
         saveat = diffrax.SaveAt(subs=diffrax.SubSaveAt(t1=True, fn=as_it_is))
         program, _ = split((self, problem))
@@ -256,9 +260,9 @@ class Solve:
         def way(args: tuple[Arrays], out: Split) -> Steps:
             (arrays,) = jax.lax.stop_gradient(args)
             solve, problem = program.whole(arrays)
-            return as_kernel(steps)(
-                arrays, some_changes(solve, problem, takes_residuals(self.solver)), failed(out, problem)
-            )
+            changes = some_changes(solve, problem, takes_residuals(self.solver))
+            found = as_kernel(steps)(arrays, changes, failed(out, problem))
+            return refused_on_the_way(found, most) if self.throw else found
 
         return way
 

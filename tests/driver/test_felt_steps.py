@@ -216,7 +216,12 @@ def test_a_lyapunov_exponent_at_the_highest_point(solver: Any) -> None:
 
 @pytest.mark.parametrize("by", [jax.jacfwd, jax.grad], ids=["forwards", "reverse"])
 @pytest.mark.parametrize("solver", ["projection", "BDF"])
-def test_too_few_steps_for_a_derivative_are_nan(solver: str, by: Any) -> None:
+def test_too_few_steps_for_a_derivative(solver: str, by: Any) -> None:
     """As many as the solution needs do not lead a derivative to the end: what it was on the way is not handed out."""
-    assert moved(jnp.zeros(()), solver, max_steps=20) == 0
-    assert jnp.isnan(by(lambda v: moved(v, solver, max_steps=20))(0.0))
+    of = lambda v, throw: moved(v, solver, max_steps=20, throw=throw)
+    assert of(jnp.zeros(()), True) == 0
+    assert jnp.isnan(by(lambda v: of(v, False))(0.0))
+    with pytest.raises(
+        jax.errors.JaxRuntimeError, match=r"SolveFailed: The derivative .* Raise `max_steps`, which is 20."
+    ):
+        jax.block_until_ready(by(lambda v: of(v, True))(0.0))
