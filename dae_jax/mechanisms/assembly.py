@@ -120,6 +120,10 @@ def _start(mechanism: "Mechanism", guess: Any) -> tuple[Coordinates, Coordinates
             if name not in q.names:
                 raise ValueError(f"`guess` has {what} of {name!r}, which is no body; bodies are {', '.join(q.names)}.")
             row = numbers(f"`guess` for the {what} of {name!r}", value, found_so_far[name].shape)
+            if what == "positions" and row.size == 7 and not isinstance(row, Tracer) and not np.any(row[3:]):
+                raise ValueError(
+                    f"`guess` for the positions of {name!r} has the quaternion 0, which is no orientation."
+                )
             found_so_far = found_so_far.put(name, row)
         found.append(found_so_far)
     return found[0], found[1]

@@ -100,6 +100,10 @@ PAIR = ((0, 0), (1, 0))
         (lambda: m.gravity("x"), "'gravity': `acceleration` must be 2 numbers or 3 numbers, but is 'x'"),
         (lambda: m.force(ROD, None), "`value` must be real numbers, but is None"),
         (lambda: HINGED.assemble({"rod": (np.nan, 0, 0)}), "`guess` for the positions of 'rod' is not finite"),
+        (
+            lambda: m.Mechanism([BLOCK], [TURN]).assemble({"block": np.zeros(7)}),
+            "positions of 'block' has the quaternion 0, which is no orientation",
+        ),
         (lambda: HINGED.assemble(at={"hinge": np.nan}), "`at` of 'hinge' is not finite"),
         (lambda: HINGED.assemble(at={"hinge": "a"}), "`at` of 'hinge' must be a number, but is 'a'"),
         (lambda: HINGED.assemble(at={"hinge": None}), "`at` of 'hinge' must be a number, but is None"),
