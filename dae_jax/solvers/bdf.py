@@ -381,10 +381,12 @@ def _solve(step: _Step, y0: Any, state: _State, smallest: Any, tol: Tolerances) 
         iteration = Iteration(step.residual, correction, combined, factors.round_off)
         scale = lambda y: weights / tol.scale(y0, y)
         eta = jnp.where(renew, 1, state.eta)
+        # Here, since each function would have it.
+        off = iteration.residual(start)
         newton = lax.cond(
             smallest & (tries > 0),
-            lambda: corrected(iteration, start, tries, scale, differential, eta, tol),
-            lambda: simplified_newton(iteration, start, weights / tol.scale(y0), eta, tol),
+            lambda: corrected(iteration, start, off, tries, scale, differential, eta, tol),
+            lambda: simplified_newton(iteration, start, off, weights / tol.scale(y0), eta, tol),
         )
         solve = functools.partial(step.linearised.solve, factors.matrix)
         seen = before.converged | factors.probe.determines(solve, step.residual, newton.x)

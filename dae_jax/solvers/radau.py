@@ -315,10 +315,12 @@ def _solve(step: Step, state: RadauState, tol: Tolerances) -> Any:
         combined = lambda rows: jnp.stack([step.linearised.combined(row, 1 / h) for row in rows])
         iteration = Iteration(step.residuals, correction, combined, factors.round_off)
         scale = lambda z: weights / tol.scale(step.y0, step.y0 + z[-1])
+        # Here, since each function would have it.
+        off = iteration.residual(start)
         newton = lax.cond(
             smallest & (tries > 0),
-            lambda: corrected(iteration, start, tries, scale, differential, state.eta, tol),
-            lambda: simplified_newton(iteration, start, weights / tol.scale(step.y0), state.eta, tol, pace),
+            lambda: corrected(iteration, start, off, tries, scale, differential, state.eta, tol),
+            lambda: simplified_newton(iteration, start, off, weights / tol.scale(step.y0), state.eta, tol, pace),
         )
         work = work.and_of(renew, refactor, newton.count)
         seen = before.converged | step.determines(factors, newton.x)

@@ -192,9 +192,9 @@ class Iteration(NamedTuple):
 
 
 def simplified_newton(
-    iteration: Iteration, start: Any, scale: Any, eta: Any, tol: Tolerances, pace: Any = None
+    iteration: Iteration, start: Any, off: Any, scale: Any, eta: Any, tol: Tolerances, pace: Any = None
 ) -> Newton:
-    """Corrects `start` until what remains, η ‖Δx‖, is small beside the tolerance; ‖Δx‖ is that of Δx · `scale`.
+    """Corrects `start`, where F is `off`, until what remains, η ‖Δx‖, is small beside the tolerance; ‖Δx‖ is that of Δx · `scale`.
 
     `pace`: the scale in which the method contracts, where that is another: a variable of index k counts h^(k−1) in it. What a
     correction leaves of the others is divided by h^(k−1) in these, so that the first one tells nothing of them.
@@ -229,7 +229,7 @@ def simplified_newton(
         theta = jnp.where(first, 0, theta)
         return Newton(x, s.count + 1, step, eta, theta, converged & jnp.isfinite(size), diverged, s.carried), left
 
-    return lax.while_loop(goes_on, correct, (not_begun(start, eta), iteration.residual(start)))[0]
+    return lax.while_loop(goes_on, correct, (not_begun(start, eta), off))[0]
 
 
 def goes_on(tries: Any, converged: Any, seen: Any, fresh: Any, smallest: Any) -> Any:
@@ -247,19 +247,19 @@ def start_of(tries: Any, predicted: Any, before: Newton) -> Any:
 def corrected(
     iteration: Iteration,
     x: Any,
+    off: Any,
     tries: Any,
     scale: Callable[[Any], Any],
     differential: Any,
     eta: Any,
     tol: Tolerances,
 ) -> Newton:
-    """One correction x + λ Δx, in the first tries with λ the largest power of ½ with which the next correction by the same
+    """One correction x + λ Δx from where F is `off`, in the first tries with λ the largest power of ½ with which the next correction by the same
     matrix is smaller, ‖Δx̄‖ ≤ (1 − λ/2) ‖Δx‖; then a whole one. Converged where it is whole and the next one is small;
     `scale(x)` is what a correction counts near x.
 
     Source: P. Deuflhard, *Newton Methods for Nonlinear Problems*, sec. 3.1.4 (the restricted monotonicity test).
     """
-    off = iteration.residual(x)
     dx = iteration.correction(off)
     scale_there = scale(x + dx)
     size = rms_norm(dx * scale_there)
