@@ -15,6 +15,10 @@ from .radau_coefficients import Coefficients, coefficients
 from .residual_steps import Tolerances, is_smallest, within
 
 
+# Stages up to which sums over them are written out. With more, a first solve is ready a tenth sooner by products, and takes as long.
+WRITTEN_OUT = 3
+
+
 class CollocationPolynomial(diffrax.AbstractLocalInterpolation):
     """The polynomial of degree s through the step's start and its s stages y₀ + zᵢ."""
 
@@ -43,7 +47,10 @@ def along(z: Float[Array, "s n"], x: Any) -> Float[Array, " n"]:
 
 
 def _combined(a: Any, x: Any) -> list[Any]:
-    """A x for a matrix of numbers and the rows of x, written out."""
+    """A x for a matrix of numbers and the rows of x: written out, or where that is longer to compile as a product."""
+    if len(a) > WRITTEN_OUT:
+        x = jnp.stack(list(x))
+        return list(jnp.asarray(a, x.dtype) @ x)
     return [sum(float(c) * x[k] for k, c in enumerate(row)) for row in a]
 
 
