@@ -45,6 +45,25 @@ def test_equals_one_at_a_time(chunk_size):
     assert found["drift"].max() < 1e-14
 
 
+def test_whole_solutions_are_a_batch_of_them(tmp_path):
+    """They hold arrays of numpy, which the diagnostics took for a solution without saved states."""
+    system = dae_jax.ConstrainedSystem(
+        lambda t, q, v, g: jnp.stack([0.0, g]), PENDULUM.system.constraint, potential=lambda q, g: -g * q[1]
+    )
+
+    def solved(g):
+        return dae_jax.daesolve(system, PROJECTED, 0.0, 1.0, None, PENDULUM.y0, g, saveat=diffrax.SaveAt(ts=np.ones(2)))
+
+    gravities = np.array([1.0, 9.81, 25.0])
+    batch = jax.vmap(solved)(gravities)
+    for store in (None, tmp_path / "store"):
+        swept = dae_jax.sweep(solved, gravities, progress=False, store=store)
+        for diagnostic in (dae_jax.drift, dae_jax.energy, dae_jax.multipliers):
+            pairs = zip(*(jax.tree.leaves(diagnostic(system, sol)) for sol in (swept, batch)), strict=True)
+            for a, b in pairs:
+                np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-13)
+
+
 def test_two_devices_give_the_same():
     angles = np.linspace(0.1, 3.0, 23)
     one = dae_jax.sweep(swing, angles, chunk_size=6, devices=jax.devices()[:1], progress=False)
@@ -330,6 +349,32 @@ def test_reductions():
     np.testing.assert_array_equal(reductions.final_state(sol)[0], sol.ys[0][-1])
 
 
+def test_the_error_of_the_energy_at_one_time_alone_is_refused():
+    """It was 0 in every lane of a sweep that saves the end only, as a solve does by default."""
+    sol = dae_jax.daesolve(PENDULUM.system, diffrax.Tsit5(), 0.0, 2.0, 0.1, PENDULUM.y0)
+    with pytest.raises(
+        ValueError, match="`energy_error` compares the saved times with the first of them, and there is one"
+    ):
+        reductions.energy_error(PENDULUM.system, sol)
+
+
+@pytest.mark.parametrize("of", [lambda q, v: (q[0], v[0]), lambda q, v: (q[:, 0], v[:, 0]), lambda q, v: q])
+def test_a_reference_of_other_shapes_is_refused(of):
+    """Two times of a pendulum, of two coordinates, were compared with numbers along the wrong axis."""
+    sol = dae_jax.daesolve(
+        PENDULUM.system, PROJECTED, 0.0, 2.0, None, PENDULUM.y0, saveat=diffrax.SaveAt(t0=True, t1=True)
+    )
+    with pytest.raises(ValueError, match="must have the structure and the shapes of"):
+        reductions.largest_error(sol, of(*sol.ys))
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_first_time_is_that_in_the_order_of_the_solve(sign):
+    ts = sign * jnp.array([0.0, 1.0, 2.0, jnp.inf])
+    assert reductions.first_time(ts, jnp.array([False, True, True, False])) == sign
+    assert reductions.first_time(ts, jnp.zeros(4, bool)) == np.inf
+
+
 def test_first_flip_of_a_pendulum_that_turns_over():
     scene = dae_jax.scenes.pendulum(angle=0.0, angular_velocity=7.0)
     times = np.linspace(0, 2, 2001)
@@ -387,7 +432,8 @@ class TestOfASolveThatEndsEarly:
         assert np.isnan(reductions.lyapunov(*args, **FAILS))
 
     def test_largest_values_are_infinite(self):
-        sol = dae_jax.daesolve(PENDULUM.system, PROJECTED, 0.0, 2.0, None, PENDULUM.y0, **FAILS)
+        both = diffrax.SaveAt(t0=True, t1=True)
+        sol = dae_jax.daesolve(PENDULUM.system, PROJECTED, 0.0, 2.0, None, PENDULUM.y0, saveat=both, **FAILS)
         assert reductions.largest_drift(PENDULUM.system, sol) == np.inf
         assert reductions.energy_error(PENDULUM.system, sol) == np.inf
 
