@@ -10,6 +10,7 @@ import time
 import types
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -239,8 +240,50 @@ def test_inputs_that_are_no_numbers_are_refused(inputs):
 
 
 def test_a_chunk_is_a_whole_number():
-    with pytest.raises(ValueError, match="must be an integer"):
-        dae_jax.sweep(lambda x: x, np.ones(3), chunk_size=2.5)
+    for wrong in (2.5, "2", np.nan, np.inf, 0):
+        with pytest.raises(ValueError, match="must be an integer"):
+            dae_jax.sweep(lambda x: x, np.ones(3), chunk_size=wrong)
+
+
+def test_what_is_traced_is_refused():
+    """It was an error of numpy, or "Computation compiled for 2 inputs but called with 1"."""
+    of = lambda x: dae_jax.sweep(lambda k: k, x * np.ones(3), progress=False)
+    closing_over = lambda x: dae_jax.sweep(lambda k: k * x, np.ones(3), progress=False)
+    for transformed in (jax.jit, jax.vmap, lambda fn: lambda x: dae_jax.sweep(fn, x, progress=False)):
+        with pytest.raises(ValueError, match="`sweep` looks at numbers"):
+            transformed(of)(jnp.ones(1))
+        with pytest.raises(ValueError, match="`fn` must not close over"):
+            transformed(closing_over)(jnp.ones(1))
+    known = jax.jit(lambda x: x * dae_jax.sweep(lambda k: 2 * k, np.ones(3), progress=False))
+    np.testing.assert_array_equal(known(3.0), 6 * np.ones(3))
+
+
+def test_a_module_with_arrays_is_a_function(tmp_path):
+    class Scaled(eqx.Module):
+        factor: jax.Array
+
+        def __call__(self, x):
+            return self.factor * x
+
+    for factor in (2.0, 3.0):
+        found = dae_jax.sweep(Scaled(jnp.full(2, factor)), np.arange(3.0), progress=False)
+        np.testing.assert_array_equal(found, factor * np.arange(3.0)[:, None] * np.ones(2))
+    dae_jax.sweep(Scaled(jnp.ones(2)), np.ones(3), progress=False, store=tmp_path / "store")
+    with pytest.raises(ValueError, match="holds another sweep"):
+        dae_jax.sweep(Scaled(jnp.zeros(2)), np.ones(3), progress=False, store=tmp_path / "store")
+
+
+def test_whole_numbers_that_do_not_fit_are_refused():
+    """2⁴⁰ was 0 without 64 bits. In a context of the thread, which others that work have not."""
+    with jax.enable_x64(False):
+        assert dae_jax.sweep(lambda x: x, np.array([2**30]), progress=False) == 2**30
+        with pytest.raises(ValueError, match="hold whole numbers that int32 does not"):
+            dae_jax.sweep(lambda x: x, np.array([2**40]), progress=False)
+
+
+def test_keys_are_no_results():
+    with pytest.raises(TypeError, match="must return arrays of numbers, but returns keys"):
+        dae_jax.sweep(lambda key: jax.random.split(key), jax.random.split(jax.random.key(0), 3), progress=False)
 
 
 def test_a_folder_of_something_else_is_refused(tmp_path):
