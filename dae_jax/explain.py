@@ -16,7 +16,6 @@ from jaxtyping import Array, Float, PyTree
 from .compiler import Decision, at_ease, decision, equations, one_kernel_enabled, without_checks
 from .driver.program import Solve
 from .driver.resets import Reset
-from .driver.start import refuse_no_time
 from .equations.constraint_jacobian import SparseNormals
 from .equations.linearised import LinearisedResidual
 from .equations.mechanical import MechanicalODE
@@ -29,7 +28,7 @@ from .solvers import takes_residuals
 from .systems import ConstrainedSystem, System, is_mechanism
 from .tables import table
 from .types import Args, Controller, Flat, ProgressMeter, Solver, State, Time
-from .validate.states import counted, with_rates
+from .validate.states import counted, refuse_no_time, with_rates
 from .validate.user_functions import at_numbers
 
 
