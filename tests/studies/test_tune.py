@@ -250,12 +250,24 @@ def test_nonholonomic_system_and_own_reference():
     np.testing.assert_allclose(loss(BAD_START), given(BAD_START), rtol=1e-5)
 
 
+def test_what_the_loss_is_not_for_is_refused(case):
+    with pytest.raises(ValueError, match="takes a ConstrainedSystem, but `system` is a SemiExplicitDAE"):
+        dae_jax.baumgarte_loss(SCENES["robertson"]().system, jnp.ones(2), 1.0, dt0=0.1)
+    for params in ({"alpha": 1.0}, {"alpha": 1.0, "beta": 1.0, "gamma": 1.0}):
+        with pytest.raises(ValueError, match="The parameters must be"):
+            case[0](params)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"dt0": -0.1}, "0 < dt0"),
         ({"dt0": 20.0}, "0 < dt0"),
         ({"dt0": 0.1, "times": 3}, "`times` must be at least"),
+        ({"dt0": 0.1, "times": 20.5}, "`times` must be at least"),
+        ({"dt0": "0.1"}, "`dt0` must be a real number"),
+        ({"dt0": 0.1, "weights": (1.0, 2.0)}, "`weights` must be three finite numbers"),
+        ({"dt0": 0.1, "weights": (1.0, 2.0, np.nan)}, "`weights` must be three finite numbers"),
         ({"dt0": 0.1, "reference": lambda t: (np.ones((2, 2)), np.ones((2, 2)))}, "`reference` must give"),
     ],
 )
