@@ -23,7 +23,7 @@ from .systems import System, is_mechanism
 from .tables import table
 from .types import Args, Flat, State, Time
 from .validate.captured import current
-from .validate.states import as_floats, counted, refuse_wrong_state
+from .validate.states import as_floats, counted, refuse_no_time, refuse_not_finite, refuse_wrong_state
 from .validate.user_functions import at_numbers, refuse_wrong_functions
 
 
@@ -175,7 +175,7 @@ class Structure:
         ]
         if not self.regular:
             lines.append(
-                "The system Jacobian is singular near the given state although its structure is not: the index may be "
+                "The system Jacobian is singular, or not finite, near the given state although its structure is not: the index may be "
                 "higher. Replace an equation by a combination of equations in which the cancelling terms are gone, or "
                 "introduce the cancelling expression as a variable."
             )
@@ -211,7 +211,9 @@ class Structure:
             "hidden constraints": _named(self.hidden_constraints()),
             "blocks": self._blocks_in_words,
             "nonzeros, bandwidth": f"{self.nonzeros}, {self.bandwidth}",
-            "system Jacobian": "regular near the given state" if self.regular else "singular near the given state",
+            "system Jacobian": "regular near the given state"
+            if self.regular
+            else "singular, or not finite, near the given state",
         }
         return table("Structure", {name: text for name, text in rows.items() if text}, str(self))
 
@@ -231,11 +233,14 @@ def analyse(system: System, t0: Time, y0: State, args: Args = None) -> Structure
     variable is read from the jaxpr, for any t; `y0` gives shapes, and the place where the Jacobian is looked at.
 
     Errors: `ValueError` for a structurally singular system, naming the equations that have too few variables and the
-    variables that have too few equations, and within `jit`, `vmap` and `grad` of what is looked at.
+    variables that have too few equations, for a state or a time that is not finite, and within `jit`, `vmap` and `grad` of
+    what is looked at.
     """
     refuse_wrong_state(system, y0)
     system, args = current((system, args))
     y0 = as_floats(y0)
+    refuse_no_time("t0", t0)
+    refuse_not_finite("y0", y0)
     refuse_wrong_functions(system, t0, y0, args)
     form = ResidualForm.of(system, t0, y0, args)
     y = form.encode(y0)

@@ -23,7 +23,7 @@ from .systems import ConstrainedSystem, System, is_mechanism
 from .types import Args, Phase, State, Time
 from .validate.captured import current
 from .validate.closures import opened
-from .validate.states import as_floats, broadcast_to_state, refuse_wrong_state, with_rates
+from .validate.states import as_floats, broadcast_to_state, refuse_not_finite, refuse_wrong_state, with_rates
 from .validate.user_functions import refuse_wrong_functions
 
 
@@ -155,6 +155,7 @@ def consistent_state(
     refuse_wrong_state(system, y0)
     system, args = opened(current((with_rates(system, yd0, y0), args)))
     y0 = as_floats(y0)
+    refuse_not_finite("y0", y0)
     refuse_wrong_functions(system, t0, y0, args)
     masks = jax.tree.map(lambda x: jnp.zeros_like(x, dtype=bool), y0)
     if fixed is not None:

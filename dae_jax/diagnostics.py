@@ -21,7 +21,7 @@ from .equations.mechanical import MechanicalODE
 from .equations.regularity import mass_is_regular, mass_message, rank_message, redundancy
 from .equations.residual_drift import EquationDrift, equation_drift
 from .equations.residual_form import bordered_multipliers
-from .solution import DAESolution, at_saved_times
+from .solution import DAESolution, at_saved_times, saved_arrays
 from .systems import ConstrainedSystem, ImplicitDAE, SemiExplicitDAE, System, is_mechanism
 from .types import Args, Phase, State, Time
 from .validate.captured import current
@@ -185,7 +185,7 @@ def _at_saved_times(system: System, sol: DAESolution, of: Callable[..., Any]) ->
     """of(system, t, y, args) at each saved time."""
     if not isinstance(sol, DAESolution):
         raise TypeError(f"`sol` must be what `daesolve` returns, but is {brief(sol)}.")
-    if not isinstance(sol.ts, jax.Array):
+    if not isinstance(sol.ts, jax.Array | np.ndarray):
         raise ValueError(
             "`sol` must have saved states: `SaveAt(t1=True)` or `SaveAt(ts=...)`, without `subs`. Of a solution with several "
             "parts take one, `dataclasses.replace(sol, ts=sol.ts[0], ys=sol.ys[0])`."
@@ -197,7 +197,7 @@ def _at_saved_times(system: System, sol: DAESolution, of: Callable[..., Any]) ->
         _refuse_no_states(system, ts, ys, args)
         return at_saved_times(current(of), system, ts, ys, args, changed)
 
-    return along(sol.ts, sol.ys, sol.args, sol.changed)
+    return along(*saved_arrays(sol))
 
 
 def _refuse_no_states(system: System, ts: Float[Array, "*batch times"], ys: State, args: Args) -> None:

@@ -15,22 +15,20 @@ from jaxtyping import Array, Float, PyTree
 
 from .compiler import Decision, at_ease, decision, equations, one_kernel_enabled, without_checks
 from .driver.program import Solve
-from .driver.start import refuse_bad_start, refuse_no_time
+from .driver.resets import Reset
 from .equations.constraint_jacobian import SparseNormals
 from .equations.linearised import LinearisedResidual
 from .equations.mechanical import MechanicalODE
-from .equations.residual_form import ResidualForm
-from .equations.structural_ode import StructuralODE
 from .formulations import AbstractFormulation
 from .linalg import SparseDefinite
 from .linalg.semidefinite import LOOPED, UNROLLED
 from .solution import precision_of
-from .solve import prepared
+from .solve import of_known_rank, prepared
 from .solvers import takes_residuals
 from .systems import ConstrainedSystem, System, is_mechanism
 from .tables import table
 from .types import Args, Controller, Flat, ProgressMeter, Solver, State, Time
-from .validate.states import counted
+from .validate.states import counted, refuse_no_time, with_rates
 from .validate.user_functions import at_numbers
 
 
@@ -45,7 +43,7 @@ class Plan:
     - `precision`: the numbers' type, and the tolerances.
     - `linear_solver`: how the linear systems of a step are solved.
     - `operations`: primitive operations of one evaluation of the field or the residual, as it is compiled.
-    - `one_kernel`: whether the whole loop is compiled to one kernel.
+    - `one_kernel`: whether the whole loop is compiled to one kernel; with a `Reset` the loop from one to the next.
     - `compiler`: who compiles it: "llvm", our compiler, as one kernel; "xla kernel", XLA as one kernel; "xla", XLA as many.
       `batch_compiler`: the same of a batch of starts under `vmap`; "xla" where XLA does it, in whatever form.
     - `reasons`: what our compiler does not take, with the equation; `hindrances`: the primitives of these equations.
@@ -97,6 +95,7 @@ class MechanicalPlan(Plan):
     - `constraints_depend_on_time`.
     - `nonzeros`, `colours`: nonzeros of the constraints' Jacobian, and the directional derivatives that it takes; `None`
       where it is dense.
+    - `chart`: of how many numbers the chart of a `StateSpace` is, which has neither multipliers nor that Jacobian; else `None`.
     """
 
     coordinates: int
@@ -106,6 +105,7 @@ class MechanicalPlan(Plan):
     constraints_depend_on_time: bool
     nonzeros: int | None
     colours: int | None
+    chart: int | None = None
 
     def _found(self) -> dict[str, str]:
         independent = self.constraints if self.independent is None else self.independent
@@ -113,6 +113,8 @@ class MechanicalPlan(Plan):
         jacobian = "dense, by forward-mode derivatives"
         if self.nonzeros is not None and self.colours is not None:
             jacobian = f"{counted(self.nonzeros, 'nonzero')} from {counted(self.colours, 'directional derivative')}"
+        if self.chart is not None:
+            jacobian = f"none, that of the chart by {counted(self.chart, 'directional derivative')}"
         return {
             "system": f"{counted(self.coordinates, 'coordinate')}, {counted(self.constraints, 'constraint')}{redundant}",
             "mass": self.mass,
@@ -189,21 +191,26 @@ def explain(
     y0: State,
     args: Args = None,
     *,
+    dt0: Time | None = None,
     formulation: AbstractFormulation | None = None,
     saveat: diffrax.SaveAt = diffrax.SaveAt(t1=True),  # noqa: B008
     stepsize_controller: Controller | None = None,
     adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint(),  # noqa: B008
-    event: diffrax.Event | None = None,
+    event: diffrax.Event | Reset | None = None,
     progress_meter: ProgressMeter = diffrax.NoProgressMeter(),  # noqa: B008
+    yd0: State = None,
 ) -> Plan:
-    """How `daesolve` would solve this, with the same arguments; nothing is solved.
+    """How `daesolve` would solve this, with the same arguments; nothing is solved. Where steps are fixed for any reason but `dt0`, that
+    may be left out.
 
     Errors: those of `daesolve` for wrong input; `ValueError` within `jit`, `vmap` and `grad` of what is looked at.
     """
     refuse_no_time("t0", t0)
-    dt0 = None if isinstance(solver, diffrax.AbstractAdaptiveSolver) else 1e-3
+    adaptive = isinstance(solver, diffrax.AbstractAdaptiveSolver)
+    if dt0 is None and (not adaptive or isinstance(stepsize_controller, diffrax.ConstantStepSize)):
+        dt0 = 1e-3
     solve, problem = prepared(
-        system, solver, t0, t0 + 1.0, dt0, y0, args, formulation, saveat, stepsize_controller, adjoint, event, 4096,
+        with_rates(system, yd0, y0), solver, t0, t0 + 1.0, dt0, y0, args, formulation, saveat, stepsize_controller, adjoint, event, 4096,
         progress_meter,
     )  # fmt: skip
     solve, problem = jax.tree.map(
@@ -211,26 +218,28 @@ def explain(
     )
     system, t0, y0, args = problem.start
     traced = any(isinstance(x, Tracer) for x in jax.tree.leaves((solve, problem)))
-    rank = problem.rank if traced else refuse_bad_start(system, t0, y0, args, solve.formulation.inverts_mass)
+    problem = problem if traced else of_known_rank(solve, problem)
     solve.refuse_wrong_functions(problem)
     precision = precision_of(jnp.result_type(t0), solve.controller)
-    kernel, arrays = solve.kernel(dataclasses.replace(problem, rank=rank))
+    resets = isinstance(solve.event, Reset)
+    if resets:  # each part is a solve that an event ends
+        solve = dataclasses.replace(solve, event=diffrax.Event(solve.event.condition))
+    kernel, arrays = solve.kernel(problem)
     starts = jax.tree.leaves(y0)
     jaxpr = jax.make_jaxpr(without_checks(kernel))(arrays)
     compiled = _compiled(solve, jaxpr, [any(x is start for start in starts) for x in arrays])
-    method = f"{(formulation or solve.formulation).name}, {_name(solver)}"
+    method = f"{(formulation or solve.formulation).named(system)}, {_name(solver)}{', from reset to reset' * resets}"
+    y, ode = eqx.filter_eval_shape(solve.encoded, problem)
     if takes_residuals(solve.solver):
-        y, linearised = solve.formulation.encode(system, t0, y0, args)
-        linearised = linearised.solved_by(solve.solver.linear_solver)
+        linearised = ode.solved_by(solve.solver.linear_solver)
         return _of_residual(linearised, t0, y, method, precision, compiled)
+    operations = _operations(solve.formulation.field, t0, y, ode)
     if solve.formulation.selects_states or not is_mechanism(system):
-        ode = StructuralODE.of(ResidualForm.of(system, t0, y0, args), jnp.result_type(t0))
-        y = jax.eval_shape(ode.encode, t0, y0)
         return StructuralPlan(
             method=method,
             precision=precision,
             linear_solver=ode.tearing.describe(ode.form.size),
-            operations=_operations(lambda y: ode.field(t0, y), y),
+            operations=operations,
             **compiled,
             left_out=() if solve.between() else ("dense output",),
             unknowns=ode.form.size,
@@ -238,24 +247,27 @@ def explain(
             differentiated=ode.orders.equations,
             invariants=sum(ode.orders.equations),
         )
-    ode = MechanicalODE.of(system, t0, y0, args, rank)
-    count = ode.holonomic + ode.nonholonomic
+    chart = None if solve.formulation.leaves_constraints else sum(x.size for x in jax.tree.leaves(y)) // 2
+    ode = ode if chart is None else ode.mechanical
+    given = MechanicalODE.of(system, t0, y0, args, problem.rank)
+    count = given.holonomic + given.nonholonomic
     sparse = ode.linear if isinstance(ode.linear, SparseNormals) else None
-    y = ode.encode(y0)
+    eliminated = _linear_solver(ode) if chart is None else f"none, {_elimination(counted(chart, 'coordinate'), chart)}"
     return MechanicalPlan(
         method=method,
         precision=precision,
-        linear_solver=_linear_solver(ode, count),
-        operations=_operations(lambda y: ode.field(t0, y), y),
+        linear_solver=eliminated,
+        operations=operations,
         **compiled,
         left_out=tuple(_left_out(ode, solve)),
         coordinates=ode.layout.size,
         constraints=count,
-        independent=None if traced else rank[1] if rank else count,
-        mass=_mass(system, ode.mass(y[0])),
+        independent=None if traced else given.rank[1] if given.rank else count,
+        mass=_mass(system, ode.mass(ode.encode(y0)[0])),
         constraints_depend_on_time=any(ode.depends_on_time),
         nonzeros=None if sparse is None else int((sparse.columns >= 0).sum()),
         colours=None if sparse is None else len(sparse.columns),
+        chart=chart,
     )
 
 
@@ -287,7 +299,7 @@ def _of_residual(
         method=method,
         precision=precision,
         linear_solver=structure.storage.describe(),
-        operations=_operations(lambda y: linearised.residual(t0, y, y), y),
+        operations=_operations(lambda y, linearised: linearised.residual(t0, y, y), y, linearised),
         **compiled,
         left_out=("directional derivatives of structural zeros",) if sum(colours) < 2 * n else (),
         unknowns=n,
@@ -309,10 +321,11 @@ _MATRICES = {2: "a full mass matrix", 3: "a block-diagonal mass matrix"}
 
 def _mass(system: ConstrainedSystem, mass: Float[Array, "..."] | None) -> str:
     kind = "unit masses" if mass is None else "diagonal masses" if mass.ndim < 2 else _MATRICES[mass.ndim]
-    return kind + (" that depend on q" if callable(system.mass) else "")
+    return kind + (f" that {'depend' if kind.endswith('masses') else 'depends'} on q" if callable(system.mass) else "")
 
 
-def _linear_solver(ode: MechanicalODE, count: int) -> str:
+def _linear_solver(ode: MechanicalODE) -> str:
+    count = ode.holonomic + ode.nonholonomic
     if isinstance(ode.linear, SparseNormals):
         gram = ode.linear.gram
         if isinstance(gram, SparseDefinite):
@@ -321,7 +334,10 @@ def _linear_solver(ode: MechanicalODE, count: int) -> str:
             f", then a dense system of {gram.rest_size}" if gram.rest_size > 1 else ""
         )
     some = "" if ode.rank is None else f"the {ode.rank[1]} that are independent of "
-    of = some + counted(count, "constraint" if some else "unknown")
+    return _elimination(some + counted(count, "constraint" if some else "unknown"), count)
+
+
+def _elimination(of: str, count: int) -> str:
     kind = "straight-line" if count <= UNROLLED else "a loop over columns" if count <= LOOPED else "Cholesky (LAPACK)"
     return f"dense elimination of {of}, {kind}"
 
@@ -350,5 +366,5 @@ def _operations(fn: Callable[..., Any], *args: PyTree) -> int:
         "convert_element_type",
         "copy",
     }
-    names = [eqn.primitive.name for eqn in equations(jax.make_jaxpr(fn)(*args))]
+    names = [eqn.primitive.name for eqn in equations(eqx.filter_make_jaxpr(fn)(*args)[0])]
     return sum(name not in moved and name not in ("jit", "pjit", "stack") for name in names)

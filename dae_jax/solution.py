@@ -294,6 +294,14 @@ def without_padding(ts: Float[Array, "*batch times"], ys: State) -> tuple[Any, A
     return ts[at], jax.tree.map(lambda y: y[at], ys)
 
 
+def saved_arrays(sol: DAESolution) -> tuple[Any, State, Args, Args]:
+    """`ts`, `ys`, `args` and `changed` as arrays of JAX. Those of a solution that `sweep` returns are numpy's, which `filter_vmap`
+    takes for the same in all lanes.
+    """
+    parts = sol.ts, sol.ys, sol.args, sol.changed
+    return jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, parts)
+
+
 @eqx.filter_jit
 def at_saved_times(
     of: Callable[..., Any],

@@ -236,13 +236,18 @@ def _run_on_numbers(program: Program, arrays: Arrays, solve: Solve, problem: Pro
 def _with_rank(program: Program, solve: Solve, problem: Problem) -> Program:
     """The program for the number of constraints that are independent at the start; it is remembered."""
     with jax.ensure_compile_time_eval():
-        rank = refuse_bad_start(*problem.start, solve.formulation.inverts_mass)
-        rows = rows_of(*problem.start, rank) if rank is not None and solve.needs_independent() else None
-    better, _ = split((solve, dataclasses.replace(problem, rank=rank, rows=rows)))
+        better, _ = split((solve, of_known_rank(solve, problem)))
     _of_known_rank[program] = better
     for oldest in list(_of_known_rank)[:-KEPT]:
         _of_known_rank.pop(oldest, None)
     return better
+
+
+def of_known_rank(solve: Solve, problem: Problem) -> Problem:
+    """The problem with the number of constraints that are independent at the start, which is refused where it is inconsistent."""
+    rank = refuse_bad_start(*problem.start, solve.formulation.inverts_mass)
+    rows = rows_of(*problem.start, rank) if rank is not None and solve.needs_independent() else None
+    return dataclasses.replace(problem, rank=rank, rows=rows)
 
 
 def _asks_for_rank(program: Program, solve: Solve, problem: Problem) -> bool:

@@ -33,7 +33,7 @@ def main(argv: list[str] | None = None) -> int:
         # Who reads the output, such as `head`, has seen enough; Python must not try to write the rest at the end.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
-    except OSError as failure:  # a disk that is full, say
+    except (MemoryError, OSError) as failure:  # a disk that is full, say
         print(f"dae-jax: {failure}", file=sys.stderr)
         return 2
 
@@ -87,7 +87,7 @@ def _add_compare(commands: argparse._SubParsersAction) -> None:
 
 
 def _compare(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> int:
-    from .compare import chosen, compare, table
+    from .compare import chosen, compare, largest, table
     from .figures import figures, write_data, write_figures
 
     scene = options.scene(parser, arguments.scene)
@@ -111,10 +111,7 @@ def _compare(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> 
             if sol is not None:
                 solutions[row.method] = sol
             written = write_data(scene, rows, points, solutions, folder)
-        print(
-            f"{scene.name}, {t1:g} s, tolerance {rtol:g}; error and drifts are the largest over 501 times, errors "
-            f"relative where the solution is larger than {scene.scale:g}"
-        )
+        print(f"{scene.name}, {t1:g} s, tolerance {rtol:g}; {largest(scene, t1)}")
         print(table(rows))
         if solutions and not points:
             print(f"– no error: the reference is known at {scene.t1:g} s only")

@@ -36,6 +36,8 @@ from ..systems import is_mechanism
 # many seconds is not asked for less error.
 TOLERANCES, STEPS = (1e4, 1e2, 1.0, 1e-2), (4.0, 2.0, 1.0, 0.5)
 LONG = 0.5
+# At so many times.
+SAVED = 501
 # Run times are measured more than a few times where all of them take less than this, in s.
 SHORT = 0.02
 
@@ -194,12 +196,24 @@ def chosen(scene: Scene, names: list[str] | None) -> dict[str, Method]:
 
 def compare(scene: Scene, by: dict[str, Method], t1: float, rtol: float) -> Iterator[tuple[Row, Any, list[Effort]]]:
     """Rows, solutions and points of the work-precision picture, one method after the other; progress on stderr."""
-    times = scene.times(t1, 501)
+    times = scene.times(t1, SAVED)
     for i, (name, method) in enumerate(by.items(), 1):
         print(f"\r{i}/{len(by)} {name:24s}", end="", file=sys.stderr, flush=True)
         row, sol = measure(scene, name, method, times, rtol)
         yield row, sol, efforts(scene, row, method, times, rtol)
     print("\r" + " " * 40 + "\r", end="", file=sys.stderr, flush=True)
+
+
+def largest(scene: Scene, t1: float) -> str:
+    """Of what the table has the largest."""
+    known = scene.known(scene.times(t1, SAVED))
+    where = f", over {len(known)} of them, {known[0]:g} to {known[-1]:g} s, the reference's" if len(known) > 1 else ""
+    if len(known) == 1:
+        where = f", at {known[0]:g} s, the reference's only time"
+    return (
+        f"error and drifts are the largest over {SAVED} times, errors relative where the solution is larger than {scene.scale:g}"
+        f"{where * (len(known) < SAVED)}"
+    )
 
 
 def table(rows: list[Row]) -> str:

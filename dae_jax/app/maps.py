@@ -100,10 +100,12 @@ def angle_map(
 def write_baumgarte_map(scene: Scene, t1: float, dt0: float, points: int, folder: Path, progress: bool) -> list[Path]:
     """The map as figure and data; the paths."""
     found = baumgarte_map(loss_of(scene, t1, dt0), points, folder / "store", progress)
-    low = np.unravel_index(np.argmin(found["loss"]), found["loss"].shape)
-    best = (found["alpha"][low[0]], found["beta"][low[1]])
-    title = f"{scene.name} for {t1:g} s, Tsit5 with steps of {dt0:g} s: best α = {best[0]:.3g}, β = {best[1]:.3g}"
-    shown = np.where(found["failed"], np.nan, found["loss"])
+    title = f"{scene.name} for {t1:g} s, Tsit5 with steps of {dt0:g} s"
+    shown, best = np.where(found["failed"], np.nan, found["loss"]), None
+    if not found["failed"].all():
+        low = np.unravel_index(np.nanargmin(shown), shown.shape)
+        best = (found["alpha"][low[0]], found["beta"][low[1]])
+        title += f": best α = {best[0]:.3g}, β = {best[1]:.3g}"
     figure = plotting.sweep_map(
         found["alpha"], found["beta"], shown, ("α in 1/s", "β in 1/s", "loss (decades of drift and of error)"), title,
         log=True, mark=best, blank=f"failed: {np.mean(found['failed']):.0%}",
@@ -117,14 +119,16 @@ def write_angle_map(scene: Scene, t1: float, rtol: float, points: int, folder: P
     degrees = np.degrees(found["first"])
     axes = ("first angle in °", "second angle in °")
     flips = np.where(np.isfinite(found["flip"]), found["flip"], np.nan)
+    failed = f"failed: {np.mean(found['failed']):.0%}" if found["failed"].any() else ""
+    no_flip = ", or ".join(filter(None, (f"no flip within {t1:g} s", failed)))
     written = []
-    for name, values, label, log in (
-        ("flip", flips, "time of the first flip in s", True),
-        ("lyapunov", found["lyapunov"], f"Lyapunov exponent over {t1:g} s in 1/s", False),
+    for name, values, label, log, blank in (
+        ("flip", flips, "time of the first flip in s", True, no_flip),
+        ("lyapunov", found["lyapunov"], f"Lyapunov exponent over {t1:g} s in 1/s", False, failed),
     ):
         figure = plotting.sweep_map(
             degrees, degrees, values, (*axes, label), f"{scene.name}, released at rest", log_values=log,
-            blank=f"no flip within {t1:g} s",
+            blank=blank,
         )  # fmt: skip
         written += _write(folder, f"angles-{name}", figure, found)
     return written

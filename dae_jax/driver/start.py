@@ -17,7 +17,7 @@ from ..equations.regularity import mass_is_regular, mass_message, rank_message, 
 from ..solution import RESULTS
 from ..systems import ConstrainedSystem, System, is_mechanism
 from ..types import Args, DType, State, Time
-from ..validate.states import NUMBERS, brief, refuse_wrong_state
+from ..validate.states import brief, refuse_no_time, refuse_not_finite, refuse_wrong_state
 from ..validate.user_functions import not_finite, time_axis_advice
 
 
@@ -32,8 +32,7 @@ def checked(system: System, t0: Time, t1: Time, dt0: Time | None, y0: State, arg
         if dtype.kind != "f" or dtype.itemsize < 4:
             real = "; write 1.0 in place of 1" if dtype.kind in "iub" else ""
             raise ValueError(f"`y0` must hold floating-point numbers, float32 or float64, but has {dtype}{real}.")
-        if not isinstance(leaf, Tracer) and not np.all(np.isfinite(np.asarray(leaf))):
-            raise ValueError(f"`y0` must be finite, but has NaN or infinity: {brief(leaf)}.")
+    refuse_not_finite("y0", y0)
     for name, value in (("t0", t0), ("t1", t1), ("dt0", dt0)):
         if value is not None or name != "dt0":
             refuse_no_time(name, value)
@@ -61,15 +60,6 @@ def _refuse_times_of_one_number(t0: Time, t1: Time, dtype: DType) -> None:
             f"`t0` = {t0} and `t1` = {t1} are one number in {np.dtype(dtype)}, which `y0` is in: measure time from another origin, or "
             "use float64."
         )
-
-
-def refuse_no_time(name: str, value: Time | None) -> None:
-    """Refuses what is no finite real number."""
-    is_number = type(value) is float or (isinstance(value, NUMBERS) and jnp.shape(value) == ())
-    if not is_number or np.dtype(jnp.result_type(value)).kind not in "fiu":
-        raise ValueError(f"`{name}` must be a real number, but is {brief(value)}.")
-    if not isinstance(value, Tracer) and not np.isfinite(np.asarray(value)):
-        raise ValueError(f"`{name}` must be finite, but is {value}.")
 
 
 def as_array(x: ArrayLike, dtype: DType) -> Any:

@@ -61,8 +61,7 @@ class ReducedResidual(AbstractResidualFormulation):
     inverts_mass: ClassVar[bool] = False
     needs_independent: ClassVar[bool] = True
 
-    @property
-    def name(self) -> str:
+    def named(self, system: System) -> str:
         return DummyDerivatives.__name__
 
     @property

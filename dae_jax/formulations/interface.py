@@ -41,9 +41,8 @@ class AbstractFormulation(eqx.Module):
     counts_constraints: ClassVar[bool] = False
     needs_independent: ClassVar[bool] = False
 
-    @property
-    def name(self) -> str:
-        """What the user calls it."""
+    def named(self, system: System) -> str:
+        """What the user calls it, for this system."""
         return type(self).__name__
 
     @property

@@ -8,7 +8,7 @@ from ..equations.constraint_jacobian import Rank
 from ..equations.independent import independent
 from ..equations.linearised import LinearisedResidual
 from ..equations.residual_form import Form, ResidualForm
-from ..systems import System
+from ..systems import System, is_mechanism
 from ..types import Args, State, Time
 from .interface import AbstractResidualFormulation
 
@@ -34,6 +34,9 @@ class Residual(AbstractResidualFormulation):
     def __check_init__(self) -> None:
         if self.form not in ("index-3", "index-2", "GGL"):
             raise ValueError(f'`form` must be "index-3", "index-2" or "GGL", but is {self.form!r}.')
+
+    def named(self, system: System) -> str:
+        return f'Residual("{self.form}")' if is_mechanism(system) else "Residual"
 
     @property
     def keeps(self) -> tuple[bool, bool]:

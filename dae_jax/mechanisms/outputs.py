@@ -158,7 +158,7 @@ def at_saved_times(sol: DAESolution, of: Callable[..., Any], what: tuple["Mechan
             return eqx.filter_vmap(along)(ts, ys, args, changed, *more)
         return solution.at_saved_times(of, what, ts, ys, args, changed, *more)
 
-    return along(sol.ts, sol.ys, sol.args, sol.changed, *more)
+    return along(*solution.saved_arrays(sol), *more)
 
 
 def _at_saved_times(

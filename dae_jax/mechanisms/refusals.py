@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import jax
+import numpy as np
 
 from ..solution import DAESolution
 from ..validate.states import brief
@@ -86,7 +87,7 @@ def refuse_no_solution(mechanism: "Mechanism", sol: Any) -> None:
     """Refuses what is no solution of this mechanism with saved states."""
     if not isinstance(sol, DAESolution):
         raise TypeError(f"`sol` must be what `daesolve` returns, but is {brief(sol)}.")
-    if not isinstance(sol.ts, jax.Array):
+    if not isinstance(sol.ts, jax.Array | np.ndarray):
         raise ValueError("`sol` must have saved states: `SaveAt(t1=True)` or `SaveAt(ts=...)`, without `subs`.")
     if not isinstance(sol.ys, tuple | list) or len(sol.ys) != 2:
         raise ValueError("`sol.ys` must hold states of this mechanism: leave out `SaveAt(fn=...)`.")

@@ -79,8 +79,16 @@ class Scene(Generic[S]):
             return np.linspace(0.0, t1, count)
         return np.concatenate([[0.0], np.geomspace(self.first, t1, count - 1)])
 
+    def known(self, times: np.ndarray) -> np.ndarray:
+        """Those of the times at which the reference knows anything of the state."""
+        within = np.asarray(times)[np.asarray(times) <= self.horizon]
+        something = [
+            np.any(~np.isnan(x).reshape(len(within), -1), axis=1) for x in jax.tree.leaves(self.reference(within))
+        ]
+        return within[np.any(something, axis=0)]
+
     def error(self, times: np.ndarray, ys: State) -> float:
-        """The largest error of states at the given times, relative where the reference is larger than `scale`."""
+        """The largest error of states at the given times where they are `known`, relative where the reference is larger than `scale`."""
         within = np.asarray(times) <= self.horizon
         exact = jax.tree.leaves(self.reference(np.asarray(times)[within]))
         off = [

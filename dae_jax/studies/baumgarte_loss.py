@@ -16,8 +16,9 @@ from ..formulations import Baumgarte
 from ..solution import RESULTS, DAESolution
 from ..solve import daesolve
 from ..solvers import DOP853, OrthogonalProjection
-from ..systems import ConstrainedSystem
+from ..systems import ConstrainedSystem, is_mechanism
 from ..types import Args, IntScalar, Solver, State, Time
+from ..validate.states import refuse_no_time, refuse_wrong_system
 
 
 # The loss of a solve that fails: above all that a solve which succeeds can have.
@@ -71,6 +72,10 @@ class BaumgarteLoss:
     weights: tuple[float, float, float]
 
     def __call__(self, params: dict[str, Any]) -> Float[Array, ""]:
+        if set(params) != {"alpha", "beta"}:
+            raise ValueError(
+                f'The parameters must be {{"alpha": α, "beta": β}}, but are {", ".join(map(repr, params))}.'
+            )
         return _by_forward_mode(self._value)({k: jnp.asarray(x, jnp.result_type(x, float)) for k, x in params.items()})
 
     def _value(self, params: dict[str, Any]) -> Float[Array, ""]:
@@ -210,16 +215,23 @@ def baumgarte_loss(
     **Returns** a function of {"alpha": α, "beta": β} for `tune` and `sweep`, differentiable in both modes; its method
     `parts` gives D, E and dt0 ρ, its method `verify` independent solves.
 
-    Errors: `ValueError` for a step that is not positive or a reference of another shape or not finite; `RuntimeError` where the
-    reference cannot be solved for.
+    Errors: `ValueError` for a system that is no mechanism, a step that is not positive, or a reference of another shape or
+    not finite; `RuntimeError` where the reference cannot be solved for.
 
     Source: U. M. Ascher, H. Chin, L. R. Petzold, S. Reich, *Stabilization of constrained mechanical systems with DAEs and
     invariant manifolds*, J. Struct. Mech. 23 (1995), on the parameters' dependence on the step size.
     """
-    if not (np.isfinite(dt0) and np.isfinite(t1) and 0 < dt0 <= t1):
+    refuse_wrong_system(system)
+    if not is_mechanism(system):
+        raise ValueError(f"`baumgarte_loss` takes a ConstrainedSystem, but `system` is a {type(system).__name__}.")
+    for name, value in (("dt0", dt0), ("t1", t1)):
+        refuse_no_time(name, value)
+    if not 0 < dt0 <= t1:
         raise ValueError(f"`dt0` and `t1` must satisfy 0 < dt0 ≤ t1, but are {dt0} and {t1}.")
-    if times < 2 * WINDOWS:
-        raise ValueError(f"`times` must be at least {2 * WINDOWS}, but is {times}.")
+    if not isinstance(times, int | np.integer) or times < 2 * WINDOWS:
+        raise ValueError(f"`times` must be at least {2 * WINDOWS}, a whole number, but is {times!r}.")
+    if np.shape(weights) != (3,) or not np.all(np.isfinite(weights)):
+        raise ValueError(f"`weights` must be three finite numbers, of drift, error and stiffness, but is {weights}.")
     y0 = jax.tree.map(jnp.asarray, tuple(y0))
     saved = np.linspace(0, t1, times + 1, dtype=jnp.result_type(*jax.tree.leaves(y0)))
     if reference is None:

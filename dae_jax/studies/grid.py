@@ -6,6 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 from jax.typing import ArrayLike
 
+from ..validate.user_functions import at_numbers
+
 
 @dataclasses.dataclass(frozen=True)
 class Grid:
@@ -25,6 +27,7 @@ class Grid:
         }
 
 
+@at_numbers
 def grid(**axes: ArrayLike | Sequence[float]) -> Grid:
     """A grid for `sweep`: `grid(alpha=..., beta=...)`. The function gets {"alpha": α, "beta": β}, the results have a
     leading axis for each name, in this order.

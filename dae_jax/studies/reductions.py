@@ -17,7 +17,7 @@ from ..systems import ConstrainedSystem, System
 from ..types import Args, Solver, State, Time
 from ..validate.captured import current
 from ..validate.closures import opened
-from ..validate.states import as_floats, broadcast_to_state, refuse_wrong_state
+from ..validate.states import as_floats, broadcast_to_state, describe, refuse_wrong_state
 
 
 def final_state(sol: DAESolution) -> Any:
@@ -31,14 +31,29 @@ def largest_drift(system: System, sol: DAESolution) -> Float[Array, ""]:
 
 
 def energy_error(system: ConstrainedSystem, sol: DAESolution) -> Float[Array, ""]:
-    """max |E(t) − E(t₀)| over the saved times, in the unit of the energy, t₀ the first of them; infinite where the solve failed."""
+    """max |E(t) − E(t₀)| over the saved times, in the unit of the energy, t₀ the first of them; infinite where the solve failed.
+
+    Errors: `ValueError` for one saved time, at which there is nothing to compare with.
+    """
     total = energy(system, sol)
+    if total.shape[-1] == 1:
+        raise ValueError(
+            "`energy_error` compares the saved times with the first of them, and there is one: save more, "
+            "`saveat=diffrax.SaveAt(ts=...)` or `SaveAt(t0=True, t1=True)`."
+        )
     return _where_it_went_well(sol, jnp.max(jnp.abs(total - total[0])), jnp.inf)
 
 
 def largest_error(sol: DAESolution, reference: State) -> Float[Array, ""]:
-    """max |y − reference| over the saved times, infinite where the solve failed; `reference` has the structure of `sol.ys`."""
+    """max |y − reference| over the saved times, infinite where the solve failed; `reference` has the structure of `sol.ys`.
+
+    Errors: `ValueError` for a reference of another structure or other shapes.
+    """
     _refuse_batch(sol)
+    if jax.tree.map(jnp.shape, sol.ys) != jax.tree.map(jnp.shape, reference):
+        raise ValueError(
+            f"`reference` must have the structure and the shapes of `sol.ys`, {describe(sol.ys)}, but is {describe(reference)}."
+        )
 
     def largest(y: State, r: State) -> Any:
         saved = jnp.isfinite(sol.ts).reshape(-1, *(1,) * (y.ndim - 1))
@@ -49,8 +64,10 @@ def largest_error(sol: DAESolution, reference: State) -> Float[Array, ""]:
 
 
 def first_time(ts: Float[Array, " times"], happened: Bool[Array, " times"]) -> Float[Array, ""]:
-    """The first of the times at which something has happened; infinite where it has not."""
-    return jnp.min(jnp.where(happened, ts, jnp.inf))
+    """The first of the times at which something has happened, in the order of the solve, forwards or backwards; infinite where it
+    has not.
+    """
+    return jnp.where(jnp.any(happened), ts[jnp.argmax(happened)], jnp.inf)
 
 
 def first_flip(ts: Float[Array, " times"], arm: Float[Array, "times 2"]) -> Float[Array, ""]:
@@ -79,7 +96,8 @@ def lyapunov(
     δy is the derivative of the solution (tangent dynamics, by `jax.jvp`) in one direction, which is made consistent with
     the constraints and the hidden ones: `direction`, with the structure of `y0`, by default 1 everywhere. `options` are
     those of `daesolve`, but for `event`, `saveat` and `adjoint`. Steps are chosen for δy as for the solution. NaN where a solve with
-    `throw=False` failed. Derivatives of the exponent are found in forward mode (`jax.jacfwd`).
+    `throw=False` failed, where the direction is zero once it is consistent, and where δy is too large or too small for a number.
+    Derivatives of the exponent are found in forward mode (`jax.jacfwd`).
 
     Errors: `TypeError` for one of these three; `ValueError` for a direction of another structure.
     """

@@ -1,6 +1,5 @@
 """`sweep`: a function of one element over many, in chunks, on all cores and devices, resumable."""
 
-import dataclasses
 import functools
 import os
 import sys
@@ -13,17 +12,20 @@ from typing import Any, Protocol
 import equinox as eqx
 import jax
 import numpy as np
+from jax.core import Tracer
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import PyTree
 
+from .._compat import trace_state_clean
 from ..compiler import at_ease, processors
 from ..driver.failures import sentence_of
 from ..solution import RESULTS
 from ..types import State
 from ..validate.captured import current
 from ..validate.states import brief
-from ..validate.user_functions import TRACED
+from ..validate.user_functions import at_numbers, refuse_untraceable
+from .elements import OfKeys, is_key, leading, one_of
 from .fingerprint import fingerprint
 from .grid import Grid
 from .progress import Progress
@@ -48,6 +50,7 @@ class Device(Protocol):
 
 
 @at_ease
+@at_numbers
 def sweep(
     fn: Callable[[Any], State],
     inputs: State | Grid,
@@ -85,29 +88,28 @@ def sweep(
     if not callable(fn):
         raise TypeError(f"`fn` must be a function of one element, but is {brief(fn)}.")
     fn, elements = current(fn), inputs.elements() if isinstance(inputs, Grid) else inputs
-    if any(map(_is_key, jax.tree.leaves(elements))):
+    if any(map(is_key, jax.tree.leaves(elements))):
         fn, elements = OfKeys.of(fn, elements)
     elements = jax.tree.map(np.asarray, elements)
-    size = _leading(elements)
+    size = leading(elements)
     devices = list(devices or jax.local_devices())
-    if chunk_size is not None and (chunk_size != int(chunk_size) or chunk_size < 1):
-        raise ValueError(f"`chunk_size` must be an integer, at least 1, but is {chunk_size}.")
-    try:
+    if chunk_size is not None and (not isinstance(chunk_size, int | np.integer) or chunk_size < 1):
+        raise ValueError(f"`chunk_size` must be an integer, at least 1, but is {chunk_size!r}.")
+    with refuse_untraceable("fn"):
+        if not trace_state_clean():
+            _refuse_traced(jax.make_jaxpr(fn)(one_of(elements)).consts)
         lanes = _lanes(fn, elements, devices[0]) if chunk_size is None else -(-int(chunk_size) // len(devices))
         chunk = min(lanes, -(-size // len(devices))) * len(devices)
         call, out = _compiled(fn, elements, chunk, devices)
-    except TRACED as error:
-        raise ValueError(
-            f"`fn` must be traceable by JAX, but makes numbers of what it is given ({str(error).splitlines()[0].rstrip('.')}): use "
-            "jax.numpy and `jnp.where` in place of numpy, `math`, `float` and `if`, and return arrays."
-        ) from error
     leaves, structure = jax.tree.flatten(out)
+    if any(jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key) for x in leaves):
+        raise TypeError("`fn` must return arrays of numbers, but returns keys: return `jax.random.key_data(key)`.")
     leaves = [jax.ShapeDtypeStruct((size, *x.shape[1:]), x.dtype) for x in leaves]
     chunks = -(-size // chunk)
     kept = (
         Memory(leaves, chunks)
         if store is None
-        else Store.open(Path(store), leaves, chunks, fingerprint(fn, _one(elements), elements, chunk))
+        else Store.open(Path(store), leaves, chunks, fingerprint(fn, one_of(elements), elements, chunk))
     )
     failures = _failures(structure)
     progress = progress and jax.process_index() == 0
@@ -127,67 +129,39 @@ def _lanes(fn: Callable[..., PyTree], elements: PyTree, device: Device) -> int:
     memory = (device.memory_stats() or {}).get("bytes_limit")
     if memory is None:
         return most
-    one = _one(elements)
+    one = one_of(elements)
     bytes_of = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves((one, jax.eval_shape(fn, one))))
     held = memory // PART_OF_MEMORY // max(bytes_of, 1)
     # A power of two: what was stored goes on where a little more or less memory is free.
     return min(most, 2 ** max(held.bit_length() - 1, 0))
 
 
-def _one(elements: PyTree) -> PyTree:
-    """The shapes of one element."""
-    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], jax.dtypes.canonicalize_dtype(x.dtype)), elements)
-
-
-@dataclasses.dataclass(frozen=True)
-class OfKeys:
-    """`fn` of elements whose keys of `jax.random.key`, the leaves that have one of `kinds`, are numbers."""
-
-    fn: Callable[..., PyTree]
-    kinds: tuple[str | None, ...]
-
-    @classmethod
-    def of(cls, fn: Callable[..., PyTree], elements: PyTree) -> tuple["OfKeys", PyTree]:
-        """The function, and the elements as numbers."""
-        leaves, structure = jax.tree.flatten(elements)
-        kinds = tuple(str(jax.random.key_impl(x)) if _is_key(x) else None for x in leaves)
-        numbers = [jax.random.key_data(x) if _is_key(x) else x for x in leaves]
-        return cls(fn, kinds), jax.tree.unflatten(structure, numbers)
-
-    def __call__(self, element: PyTree) -> PyTree:
-        leaves, structure = jax.tree.flatten(element)
-        keyed = [
-            x if k is None else jax.random.wrap_key_data(x, impl=k) for x, k in zip(leaves, self.kinds, strict=True)
-        ]
-        return self.fn(jax.tree.unflatten(structure, keyed))
-
-
-def _is_key(x: object) -> bool:
-    return isinstance(x, jax.Array) and jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)
-
-
-def _leading(elements: PyTree) -> int:
-    wrong = [x for x in jax.tree.leaves(elements) if not (jax.dtypes.issubdtype(x.dtype, np.number) or x.dtype == bool)]
-    if wrong:
-        raise TypeError(f"`inputs` must be arrays of numbers, but holds {brief(wrong[0])}.")
-    shapes = [x.shape for x in jax.tree.leaves(elements)]
-    sizes = {s[0] if s else None for s in shapes}
-    if len(sizes) != 1 or None in sizes or 0 in sizes:
+def _refuse_traced(closed_over: Sequence[Any]) -> None:
+    if any(isinstance(x, Tracer) for x in closed_over):
         raise ValueError(
-            f"`inputs` must be arrays with a common leading axis that is not empty, but have the shapes {shapes}."
+            "`fn` must not close over what `jit`, `vmap` or `grad` traces: `sweep` computes numbers. Call it outside of them, or take "
+            "`jax.vmap(fn)` within."
         )
-    return shapes[0][0]
 
 
 def _compiled(fn: Callable[..., PyTree], elements: PyTree, chunk: int, devices: list[Device]) -> tuple[Any, Any]:
     """The compiled function of one chunk, and the shapes of its results."""
-    batched, placed = _batched(fn, tuple(devices))
+    # A module with arrays in it has no hash: it is compiled each time.
+    batched, placed = _batched(fn if _has_hash(fn) else functools.partial(fn), tuple(devices))
     shape = lambda x: jax.ShapeDtypeStruct(
         (chunk, *x.shape[1:]), jax.dtypes.canonicalize_dtype(x.dtype), sharding=placed
     )
     lowered = batched.lower(jax.tree.map(shape, elements))
     compiled = lowered.compile()
     return lambda part: compiled(jax.device_put(part, placed)), lowered.out_info
+
+
+def _has_hash(fn: object) -> bool:
+    try:
+        hash(fn)
+    except TypeError:
+        return False
+    return True
 
 
 @functools.lru_cache(maxsize=16)
@@ -213,11 +187,14 @@ def _run(
     size = jax.tree.leaves(elements)[0].shape[0]
     mine = [c for c in np.flatnonzero(~kept.done) if c % jax.process_count() == jax.process_index()]
     workers = max(processors() // len(devices), 1) if devices[0].platform == "cpu" else 2
+    # A context, `with jax.enable_x64(True)`, is that of its thread.
+    precise = jax.dtypes.canonicalize_dtype(float) == np.float64
 
     def work(c: int) -> tuple[int, list[np.ndarray]]:
         # The last chunk is filled with its last element, so that one compiled function serves all.
         at = np.minimum(np.arange(c * chunk, (c + 1) * chunk), size - 1)
-        out = call(jax.tree.map(lambda x: x[at], elements))
+        with jax.enable_x64(precise):
+            out = call(jax.tree.map(lambda x: x[at], elements))
         count = min(chunk, size - c * chunk)
         return c, [np.asarray(x)[:count] for x in jax.tree.leaves(out)]
 

@@ -12,7 +12,8 @@ from jaxtyping import Array, Float, PyTree
 
 from ..compiler import at_ease
 from ..tables import table
-from ..validate.states import NUMBERS, brief, counted
+from ..validate.states import NUMBERS, brief, counted, describe
+from ..validate.user_functions import at_numbers, refuse_untraceable
 from .progress import Progress
 
 
@@ -78,14 +79,19 @@ class Tuned(NamedTuple):
 
 
 class _Point(NamedTuple):
+    """Where a descent is. `first`: the first finite loss; `mark`: the best when it was last lower by enough, `stale` steps ago."""
+
     z: Float[Array, " parameters"]
     state: Any
     best_z: Float[Array, " parameters"]
     best: Float[Array, ""]
+    first: Float[Array, ""]
+    mark: Float[Array, ""]
     stale: Any
 
 
 @at_ease
+@at_numbers
 def tune(
     loss: Callable[[Any], Any],
     params: PyTree,
@@ -103,7 +109,8 @@ def tune(
 
         z ← z + optimiser(∂loss/∂z),
 
-    so that a step changes every parameter by a factor and none becomes negative.
+    so that a step changes every parameter by a factor and none becomes negative. By default a loss in another unit, or with another
+    constant added, is the same loss.
 
     **Arguments**
 
@@ -113,17 +120,19 @@ def tune(
     - `params`: any pytree of positive numbers: the first start.
     - `optimiser`: any optax optimiser; by default the gradient clipped to norm 1, then Adam with Nesterov's momentum and a rate
       that falls from 0.3 to 0.01 along a cosine.
-    - `steps`: at most so many; ends earlier where no start has improved by `tolerance` within `patience` steps.
+    - `steps`: at most so many; ends earlier where within `patience` steps no start has lowered its loss by a part `tolerance` of it, or
+      of what it has lowered it by in all, whichever is less.
     - `starts`: how many descents run at once, batched. The others begin at `params` times factors drawn from
       1/`spread` to `spread`, uniformly in the logarithm, with `key`.
     - `progress`: whether a bar is shown on stderr.
 
-    A point where the loss or its gradient is not finite is never the best, and the descent goes half-way back to its
-    best point.
+    A point where the loss or its gradient is not finite, or a parameter too large or too small for a positive number, is never the
+    best, and the descent goes half-way back to its best point.
 
     **Returns** a `Tuned`.
 
-    Errors: `ValueError` for parameters that are not positive, and where the loss is finite nowhere.
+    Errors: `ValueError` for parameters that are not positive, for a loss that is no real number or not traceable, where it is finite
+    nowhere, and within `jit`, `vmap` and `grad` of what is looked at.
     """
     for tuned in descent(  # noqa: B007
         loss, params, optimiser, steps=steps, starts=starts, progress=progress, spread=spread, patience=patience,
@@ -149,21 +158,25 @@ def descent(
     """`tune`, with what was found so far after every few steps."""
     if not callable(loss):
         raise TypeError(f"`loss` must be a function of the parameters, but is {brief(loss)}.")
+    _refuse_wrong_options(optimiser, spread, tolerance, key, steps=steps, starts=starts, patience=patience)
+    if not jax.tree.leaves(params):
+        raise ValueError(f"`params` must hold numbers, but is {params}.")
     logs, unravel = ravel_pytree(jax.tree.map(_checked_log, params))
-    if steps < 1 or starts < 1:
-        raise ValueError(f"`steps` and `starts` must be at least 1, but are {steps} and {starts}.")
     if optimiser is None:
         import optax
 
         rate = optax.cosine_decay_schedule(0.3, steps, 0.01 / 0.3)
-        optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.nadam(rate, b2=0.95))
+        # Beside the gradient of a loss in any unit; the square of what is smaller is zero.
+        least = float(jnp.finfo(logs.dtype).tiny) ** 0.5
+        optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.nadam(rate, b2=0.95, eps=least))
     key = jax.random.key(0) if key is None else key
     factors = jax.random.uniform(key, (starts, logs.size), logs.dtype, -1, 1) * jnp.log(spread)
     z = logs + factors.at[0].set(0)
     point_at = lambda z: unravel(jnp.exp(z))
     derivative, cost = _value_and_gradient(lambda z: loss(point_at(z)), logs)
     advance = _compiled(derivative, point_at, optimiser, tolerance)
-    point = jax.vmap(lambda z: _Point(z, optimiser.init(z), z, jnp.asarray(jnp.inf, z.dtype), 0))(z)
+    unknown = jnp.asarray(jnp.inf, z.dtype)
+    point = jax.vmap(lambda z: _Point(z, optimiser.init(z), z, unknown, unknown, unknown, 0))(z)
     records = []
     with Progress("tune", steps, progress) as shown:
         for done in range(0, steps, BLOCK):
@@ -171,7 +184,9 @@ def descent(
             records.append(jax.tree.map(np.asarray, record))
             best = float(jnp.min(point.best))
             if not np.isfinite(best):
-                raise ValueError(f"`loss` or its gradient is not finite at any of the first {BLOCK} points.")
+                raise ValueError(
+                    f"`loss` or its gradient is not finite at any of the first {min(BLOCK, steps)} points."
+                )
             settled = int(jnp.min(point.stale)) >= patience
             shown.total = min(done + BLOCK, steps) if settled else steps
             shown.show(min(done + BLOCK, steps), f"best {best:.6g}{settled * ', settled'}")
@@ -191,8 +206,23 @@ def _short(x: Any) -> Any:
     return np.vectorize(lambda number: float(f"{number:.6g}"), otypes=[float])(x).tolist()
 
 
+def _refuse_wrong_options(optimiser: Any, spread: float, tolerance: float, key: Any, **counts: int) -> None:
+    for name, count in counts.items():
+        if not isinstance(count, int | np.integer) or count < 1:
+            raise ValueError(f"`{name}` must be a whole number of at least 1, but is {count!r}.")
+    if not 1 <= spread < np.inf:
+        raise ValueError(f"`spread` must be a factor of at least 1, but is {spread}.")
+    if not 0 <= tolerance < 1:
+        raise ValueError(f"`tolerance` must be a part of the loss, from 0 to 1, but is {tolerance}.")
+    if optimiser is not None and not (hasattr(optimiser, "init") and hasattr(optimiser, "update")):
+        raise TypeError(f"`optimiser` must be one of optax, such as optax.adam(0.1), but is {brief(optimiser)}.")
+    if key is not None and not isinstance(key, jax.Array):
+        raise TypeError(f"`key` must be one of `jax.random.key(...)`, but is {brief(key)}.")
+
+
 def _checked_log(p: Any) -> Any:
-    if not isinstance(p, NUMBERS) or not np.all(np.asarray(p) > 0) or not np.all(np.isfinite(np.asarray(p))):
+    numbers = isinstance(p, NUMBERS) and np.isrealobj(np.asarray(p))
+    if not numbers or not np.all(np.asarray(p) > 0) or not np.all(np.isfinite(np.asarray(p))):
         raise ValueError(f"`params` must be positive and finite, but hold {p}.")
     return jnp.log(jnp.asarray(p, jnp.result_type(float, p)))
 
@@ -206,9 +236,10 @@ def _value_and_gradient(f: Callable[..., Any], z: Any) -> tuple[Callable[..., An
 
     modes = [(forward, 1 + z.size), (jax.value_and_grad(f), 4)]
     first, second = modes if z.size <= FEW else modes[::-1]
-    shape = jax.eval_shape(f, z)
-    if getattr(shape, "shape", None) != ():
-        raise ValueError(f"`loss` must return a real number, but returns {shape}.")
+    with refuse_untraceable("loss"):
+        shape = jax.eval_shape(f, z)
+    if getattr(shape, "shape", None) != () or not jnp.issubdtype(shape.dtype, jnp.floating):
+        raise ValueError(f"`loss` must return a real number, but returns {describe(shape)}.")
     try:
         jax.eval_shape(first[0], z)
     except (TypeError, ValueError, NotImplementedError):
@@ -222,10 +253,13 @@ def _compiled(
 ) -> Callable[..., Any]:
     def step(point: _Point, _: Any) -> tuple[_Point, Any]:
         value, gradient = derivative(point.z)
-        fine = jnp.isfinite(value) & jnp.all(jnp.isfinite(gradient))
+        params = jax.tree.leaves(point_at(point.z))
+        inside = jnp.all(jnp.stack([jnp.all((x > 0) & (x < jnp.inf)) for x in params]))
+        fine = inside & jnp.isfinite(value) & jnp.all(jnp.isfinite(gradient))
         better = fine & (value < point.best)
-        # The first finite loss is an improvement of any size.
-        improved = better & ~(point.best - value <= tolerance)
+        # The first finite loss is lower by any measure.
+        first = jnp.where(better & jnp.isinf(point.first), value, point.first)
+        improved = better & ~(point.mark - value <= tolerance * jnp.minimum(first - value, jnp.abs(value)))
         update, state = optimiser.update(gradient, point.state, point.z)
         best_z, best = jnp.where(better, point.z, point.best_z), jnp.where(better, value, point.best)
         after = _Point(
@@ -233,6 +267,8 @@ def _compiled(
             jax.tree.map(lambda a, b: jnp.where(fine, a, b), state, point.state),
             best_z,
             best,
+            first,
+            jnp.where(improved, value, point.mark),
             jnp.where(improved, 0, point.stale + 1),
         )
         return after, (value, best, point_at(point.z), jnp.linalg.norm(gradient))

@@ -2,17 +2,18 @@
 
 import dataclasses
 import inspect
+import math
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import ShapedArray
+from jax.core import ShapedArray, Tracer
 from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from ..systems import AbstractSystem, System, is_implicit, is_mechanism
-from ..types import State
+from ..types import State, Time
 
 
 NUMBERS = (jax.Array, np.ndarray, np.generic, jax.ShapeDtypeStruct, float, int, complex, bool)
@@ -79,6 +80,24 @@ def refuse_wrong_state(system: System, y0: State, name: str = "y0") -> None:
     for leaf in leaves:
         if not isinstance(leaf, NUMBERS):
             raise TypeError(f"`{name}` must hold arrays of floating-point numbers, but holds {brief(leaf)}.")
+    if not any(map(math.prod, map(jnp.shape, leaves))):
+        raise ValueError(f"`{name}` must hold numbers, but its arrays are empty: {describe(y0)}.")
+
+
+def refuse_not_finite(name: str, state: State) -> None:
+    """Refuses NaN and infinity, where they are known."""
+    for leaf in jax.tree.leaves(state):
+        if not isinstance(leaf, Tracer) and not np.all(np.isfinite(np.asarray(leaf))):
+            raise ValueError(f"`{name}` must be finite, but has NaN or infinity: {brief(leaf)}.")
+
+
+def refuse_no_time(name: str, value: Time | None) -> None:
+    """Refuses what is no finite real number."""
+    is_number = type(value) is float or (isinstance(value, NUMBERS) and jnp.shape(value) == ())
+    if not is_number or np.dtype(jnp.result_type(value)).kind not in "fiu":
+        raise ValueError(f"`{name}` must be a real number, but is {brief(value)}.")
+    if not isinstance(value, Tracer) and not np.isfinite(np.asarray(value)):
+        raise ValueError(f"`{name}` must be finite, but is {value}.")
 
 
 def as_floats(state: State) -> Any:

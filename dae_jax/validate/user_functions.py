@@ -1,9 +1,10 @@
 """What the user's functions take and return, looked at without numbers: wrong ones are refused in a sentence."""
 
+import contextlib
 import functools
 import inspect
 import types
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator
 from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
@@ -50,6 +51,18 @@ def at_numbers(fn: Callable[P, T]) -> Callable[P, T]:
             ) from error
 
     return checked
+
+
+@contextlib.contextmanager
+def refuse_untraceable(name: str) -> Iterator[None]:
+    """Around the tracing of the user's function of this name, which may make numbers of what it is given."""
+    try:
+        yield
+    except TRACED as error:
+        raise ValueError(
+            f"`{name}` must be traceable by JAX, but makes numbers of what it is given ({_first_line(error)}): use jax.numpy "
+            "and `jnp.where` in place of numpy, `math`, `float` and `if`, and return arrays."
+        ) from error
 
 
 # The last functions that have been seen to have the same numbers in them each time they are called, by their keys.

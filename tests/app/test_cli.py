@@ -2,6 +2,7 @@
 
 import argparse
 import csv
+import dataclasses
 import gc
 import os
 import re
@@ -20,6 +21,7 @@ from dae_jax.app import cli, compare, maps
 from dae_jax.app.cli import main
 from dae_jax.app.interrupts import interruptible
 from dae_jax.app.plotting import FILE_TYPES
+from dae_jax.scenes import SCENES
 
 
 ROOT = Path(cli.__file__).parents[2]
@@ -75,6 +77,50 @@ def test_sweep_draws_the_map_of_alpha_and_beta(tmp_path, capsys):
     counts = [int(count) for count in re.findall(r"(\d+) × The solution", captured.err)]
     assert sum(counts) == failed
     assert "× The solution is not finite" in captured.err
+
+
+def test_of_errors_is_said_at_which_times_the_reference_is_known():
+    """Those of chaotic scenes, and of published ones, were "over 501 times" too."""
+    pendulum = SCENES["pendulum"]()
+    assert compare.largest(pendulum, 10.0).endswith("larger than 1")
+    known = dataclasses.replace(pendulum, horizon=2.0)
+    assert compare.largest(known, 10.0).endswith(", over 101 of them, 0 to 2 s, the reference's")
+    assert compare.largest(SCENES["akzo-nobel"](), 180.0).endswith(", at 180 s, the reference's only time")
+
+
+@pytest.mark.parametrize(("failed", "mark"), [([[1, 1], [1, 1]], False), ([[1, 0], [1, 1]], True)])
+def test_what_failed_is_not_the_best(failed, mark, monkeypatch, tmp_path):
+    drawn = []
+    axis, of_all = np.array([1.0, 2.0]), {name: np.full((2, 2), 51.0) for name in ("loss", "drift", "error")}
+    found = {"alpha": axis, "beta": axis, **of_all, "failed": np.array(failed, bool)}
+    monkeypatch.setattr(maps, "baumgarte_map", lambda *_: found)
+    monkeypatch.setattr(maps, "loss_of", lambda *_: None)
+    monkeypatch.setattr(maps, "_write", lambda folder, name, figure, data: drawn.append(figure) or [])
+    maps.write_baumgarte_map(SCENES["pendulum"](), 5.0, 4.0, 2, tmp_path, False)
+    (figure,) = drawn
+    assert ("best α = 1, β = 2" in figure.axes[0].get_title()) == mark
+    assert bool(figure.axes[0].lines) == mark
+
+
+@pytest.mark.parametrize("failed", [False, True])
+def test_what_failed_is_no_swing_without_a_flip(failed, monkeypatch, tmp_path):
+    drawn = []
+    axis = np.array([-1.0, 1.0])
+    found = {"first": axis, "second": axis, "flip": np.array([[1.0, np.inf], [2.0, 3.0]]), "lyapunov": np.ones((2, 2))}
+    found |= {"failed": np.array([[False, failed], [False, False]])}
+    found["lyapunov"][found["failed"]] = np.nan
+    monkeypatch.setattr(maps, "angle_map", lambda *_: found)
+    monkeypatch.setattr(maps, "_write", lambda folder, name, figure, data: drawn.append(figure) or [])
+    maps.write_angle_map(SCENES["double-pendulum"](), 3.0, 1e-6, 2, tmp_path, False)
+    said = [[text.get_text() for legend in figure.legends for text in legend.get_texts()] for figure in drawn]
+    assert said == (
+        [["no flip within 3 s, or failed: 25%"], ["failed: 25%"]] if failed else [["no flip within 3 s"], []]
+    )
+
+
+def test_a_grid_beyond_the_memory_is_one_line(tmp_path, capsys):
+    assert main(["sweep", "angles", "--points", "10000000", "--out", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.startswith("dae-jax: Unable to allocate")
 
 
 def test_sweep_draws_the_maps_of_initial_angles(tmp_path):

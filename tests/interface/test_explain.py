@@ -74,6 +74,23 @@ PAIRS = {
     "car axis, Radau": (lambda: SCENES["car-axis"](), dae_jax.RadauIIA5(), {}),
     "robertson, Kvaerno3": (lambda: SCENES["robertson"](), diffrax.Kvaerno3(), {}),
     "amplifier, BDF": (lambda: SCENES["amplifier"](), dae_jax.BDF(), {}),
+    "pendulum, event": (
+        lambda: SCENES["pendulum"](), PROJECTED, {"event": diffrax.Event(lambda t, y, args, **_: y[0][0])},
+    ),
+    "pendulum, reset": (
+        lambda: SCENES["pendulum"](), PROJECTED,
+        {"event": dae_jax.Reset(lambda t, y, args, **_: y[0][0], lambda t, y, args: (y, args))},
+    ),
+    "robertson, reset": (
+        lambda: SCENES["robertson"](), dae_jax.BDF(),
+        {"event": dae_jax.Reset(lambda t, y, args, **_: y[0][0] - 0.9, lambda t, y, args: (y, args))},
+    ),
+    "pendulum, forward derivatives": (
+        lambda: SCENES["pendulum"](), PROJECTED, {"adjoint": diffrax.ForwardMode()},
+    ),
+    "pendulum, derivatives through the loop": (
+        lambda: SCENES["pendulum"](), PROJECTED, {"adjoint": diffrax.DirectAdjoint()},
+    ),
 }  # fmt: skip
 
 
@@ -161,6 +178,62 @@ def test_says_what_a_scene_has_and_has_not():
     assert "time derivatives of the constraints" not in moving.left_out
     dense = plan(SCENES["pendulum"](), saveat=diffrax.SaveAt(dense=True))
     assert "dense output" not in dense.left_out
+
+
+def test_steps_that_are_fixed_are_said():
+    """`explain` had no `dt0`, and spoke of tolerances that the solve has not."""
+    assert plan(SCENES["pendulum"](), diffrax.Tsit5(), dt0=0.05).precision == "float64, fixed steps"
+    constant = plan(SCENES["pendulum"](), diffrax.Tsit5(), stepsize_controller=diffrax.ConstantStepSize())
+    assert constant.precision == "float64, fixed steps"
+
+
+def test_rates_may_be_given():
+    roots = dae_jax.ImplicitDAE(lambda t, y, yd, args: yd**2 - 1 - y**2)
+    found = dae_jax.explain(roots, dae_jax.RadauIIA5(), 0.0, jnp.zeros(1), yd0=jnp.ones(1))
+    assert found.method == "Residual, RadauIIA5"
+
+
+def test_the_form_of_the_equations_is_said():
+    scene = SCENES["pendulum"]()
+    assert plan(scene, dae_jax.RadauIIA5()).method == 'Residual("GGL"), RadauIIA5'
+    assert dae_jax.Residual("index-3").named(scene.system) == 'Residual("index-3")'
+    assert dae_jax.Residual().named(SCENES["robertson"]().system) == "Residual"
+
+
+def test_operations_are_those_of_the_formulation():
+    """What Baumgarte feeds back was not counted, and of a chart the multipliers were that it has not."""
+    scene = SCENES["pendulum"]()
+    with dae_jax.configure(one_kernel=False):
+        plain = plan(scene, diffrax.Tsit5())
+        fed_back = plan(scene, diffrax.Tsit5(), formulation=dae_jax.Baumgarte(1.0, 2.0))
+        in_chart = plan(scene, diffrax.Tsit5(), formulation=dae_jax.StateSpace(scene.chart))
+    assert fed_back.operations > plain.operations
+    assert in_chart.operations != plain.operations
+    assert in_chart.chart == 1
+    assert in_chart.linear_solver == "none, dense elimination of 1 coordinate, straight-line"
+    assert "none, that of the chart by 1 directional derivative" in str(in_chart)
+
+
+def test_of_redundant_constraints_as_many_are_counted_as_the_method_takes():
+    """Two coordinates, one of two constraints."""
+    scene = SCENES["pendulum"]()
+    twice = lambda t, q, args: jnp.stack([q @ q - 1, 2 * (q @ q - 1)])
+    scene = dataclasses.replace(scene, system=dae_jax.ConstrainedSystem(scene.system.force, twice))
+    with dae_jax.configure(one_kernel=False):
+        implicit = plan(scene, dae_jax.RadauIIA5(), formulation=dae_jax.Residual("index-3"))
+        explicit = plan(scene, diffrax.Tsit5(), formulation=dae_jax.DummyDerivatives())
+    assert implicit.unknowns == 2 * 2 + 1
+    assert (explicit.unknowns, explicit.invariants) == (2 * 2 + 1, 2 + 2 * 1)
+
+
+def test_a_matrix_depends_and_masses_depend():
+    system = SCENES["pendulum"]().system
+    for mass, said in (
+        (lambda q, args: jnp.diag(1 + q**2), "a full mass matrix that depends on q"),
+        (lambda q, args: 1 + q**2, "diagonal masses that depend on q"),
+    ):
+        heavy = dataclasses.replace(SCENES["pendulum"](), system=dataclasses.replace(system, mass=mass))
+        assert plan(heavy, diffrax.Euler()).mass == said
 
 
 def test_a_long_chain_is_sparse():

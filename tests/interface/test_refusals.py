@@ -147,6 +147,8 @@ STATES = {
     "integers": (started((jnp.array([1, 0]), V0)), "`y0` must hold floating-point numbers, float32 or float64, but has int64; write 1.0 in place of 1."),
     "a flat (x, z)": (started(jnp.ones(4), PAIR, RADAU), "`y0` must be the pair (x, z) of a SemiExplicitDAE"),
     "nothing": (started({}, DECAY, RADAU), "`y0` must hold numbers, but is empty: {}."),
+    "no numbers": (started(jnp.zeros(0), DECAY, RADAU), "`y0` must hold numbers, but its arrays are empty: float64[0]."),
+    "no coordinates": (started((jnp.zeros(0), jnp.zeros(0))), "its arrays are empty: (float64[0], float64[0])."),
     "t1 in words": (given(t1="1"), "`t1` must be a real number, but is '1'."),
     "an interval below float32": (
         lambda: D.daesolve(PENDULUM, PROJECTED, 1e8, 1e8 + 3, None, jax.tree.map(jnp.float32, (Q0, V0))),
@@ -253,6 +255,9 @@ AROUND = {
     "consistent_state of a vector": (lambda: D.consistent_state(PENDULUM, 0.0, jnp.ones(4)), "`y0` must be the pair (q, v)"),
     "consistent_state fixed for all": (lambda: D.consistent_state(PENDULUM, 0.0, (Q0, V0), fixed=True), "`fixed` must hold booleans in the structure of the state"),
     "consistent_state fixed in another shape": (lambda: D.consistent_state(PENDULUM, 0.0, (Q0, V0), fixed=(np.ones(3, bool), False)), "(float64[2], float64[2]), but is (bool[3], bool[])."),
+    "consistent_state of NaN": (lambda: D.consistent_state(PENDULUM, 0.0, (Q0, V0 * jnp.nan)), "`y0` must be finite, but has NaN or infinity"),
+    "analyse of nothing": (lambda: D.analyse(DECAY, 0.0, jnp.zeros(0)), "`y0` must hold numbers, but its arrays are empty: float64[0]."),
+    "grid within jit": (lambda: jax.jit(lambda a: D.grid(a=a * Q0).shape[0] + a)(1.0), "`grid` looks at numbers, which are not known within `jit`"),
     "analyse of a vector": (lambda: D.analyse(PENDULUM, 0.0, jnp.ones(4)), "`y0` must be the pair (q, v)"),
     "analyse of a function": (lambda: D.analyse(force, 0.0, jnp.ones(4)), "ImplicitDAE, but is a function."),
     "analyse within jit": (lambda: jax.jit(lambda a: D.analyse(PENDULUM, 0.0, (a * Q0, V0)).index + a)(1.0), "`analyse` looks at numbers, which are not known within `jit`"),

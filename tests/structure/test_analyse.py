@@ -202,6 +202,21 @@ def test_what_is_singular_at_the_rates_of_the_equations_is_found():
     assert dae_jax.analyse(crossing, 0.0, jnp.array([1.0, 0.5])).regular
 
 
+@pytest.mark.parametrize(("t0", "y0"), [(0.0, np.array([np.nan, 1.0])), (np.inf, np.ones(2)), (np.nan, np.ones(2))])
+def test_a_state_and_a_time_must_be_finite(t0, y0):
+    """It was said that the system Jacobian is singular, and the index may be higher."""
+    with pytest.raises(ValueError, match="must be finite"):
+        dae_jax.analyse(implicit(lambda t, y, yd, args: yd - t * y), t0, y0)
+
+
+def test_slopes_that_are_infinite_are_not_called_singular_alone():
+    found = dae_jax.analyse(
+        implicit(lambda t, y, yd, args: jnp.stack([yd[0] - y[1], jnp.sqrt(y[1]) - y[0]])), 0.0, jnp.zeros(2)
+    )
+    assert not found.regular
+    assert "singular, or not finite, near the given state" in str(found)
+
+
 def test_an_equation_given_twice_is_no_equation():
     found = dae_jax.analyse(
         implicit(lambda t, y, yd, a: jnp.stack([yd[0] + y[1], 2 * yd[0] + 2 * y[1]])), 0.0, jnp.ones(2)

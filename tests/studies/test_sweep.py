@@ -10,6 +10,7 @@ import time
 import types
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -43,6 +44,25 @@ def test_equals_one_at_a_time(chunk_size):
     for angle, q in zip(angles, found["q"], strict=True):
         np.testing.assert_allclose(q, one(angle)["q"], rtol=1e-12, atol=1e-13)
     assert found["drift"].max() < 1e-14
+
+
+def test_whole_solutions_are_a_batch_of_them(tmp_path):
+    """They hold arrays of numpy, which the diagnostics took for a solution without saved states."""
+    system = dae_jax.ConstrainedSystem(
+        lambda t, q, v, g: jnp.stack([0.0, g]), PENDULUM.system.constraint, potential=lambda q, g: -g * q[1]
+    )
+
+    def solved(g):
+        return dae_jax.daesolve(system, PROJECTED, 0.0, 1.0, None, PENDULUM.y0, g, saveat=diffrax.SaveAt(ts=np.ones(2)))
+
+    gravities = np.array([1.0, 9.81, 25.0])
+    batch = jax.vmap(solved)(gravities)
+    for store in (None, tmp_path / "store"):
+        swept = dae_jax.sweep(solved, gravities, progress=False, store=store)
+        for diagnostic in (dae_jax.drift, dae_jax.energy, dae_jax.multipliers):
+            pairs = zip(*(jax.tree.leaves(diagnostic(system, sol)) for sol in (swept, batch)), strict=True)
+            for a, b in pairs:
+                np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-13)
 
 
 def test_two_devices_give_the_same():
@@ -220,8 +240,50 @@ def test_inputs_that_are_no_numbers_are_refused(inputs):
 
 
 def test_a_chunk_is_a_whole_number():
-    with pytest.raises(ValueError, match="must be an integer"):
-        dae_jax.sweep(lambda x: x, np.ones(3), chunk_size=2.5)
+    for wrong in (2.5, "2", np.nan, np.inf, 0):
+        with pytest.raises(ValueError, match="must be an integer"):
+            dae_jax.sweep(lambda x: x, np.ones(3), chunk_size=wrong)
+
+
+def test_what_is_traced_is_refused():
+    """It was an error of numpy, or "Computation compiled for 2 inputs but called with 1"."""
+    of = lambda x: dae_jax.sweep(lambda k: k, x * np.ones(3), progress=False)
+    closing_over = lambda x: dae_jax.sweep(lambda k: k * x, np.ones(3), progress=False)
+    for transformed in (jax.jit, jax.vmap, lambda fn: lambda x: dae_jax.sweep(fn, x, progress=False)):
+        with pytest.raises(ValueError, match="`sweep` looks at numbers"):
+            transformed(of)(jnp.ones(1))
+        with pytest.raises(ValueError, match="`fn` must not close over"):
+            transformed(closing_over)(jnp.ones(1))
+    known = jax.jit(lambda x: x * dae_jax.sweep(lambda k: 2 * k, np.ones(3), progress=False))
+    np.testing.assert_array_equal(known(3.0), 6 * np.ones(3))
+
+
+def test_a_module_with_arrays_is_a_function(tmp_path):
+    class Scaled(eqx.Module):
+        factor: jax.Array
+
+        def __call__(self, x):
+            return self.factor * x
+
+    for factor in (2.0, 3.0):
+        found = dae_jax.sweep(Scaled(jnp.full(2, factor)), np.arange(3.0), progress=False)
+        np.testing.assert_array_equal(found, factor * np.arange(3.0)[:, None] * np.ones(2))
+    dae_jax.sweep(Scaled(jnp.ones(2)), np.ones(3), progress=False, store=tmp_path / "store")
+    with pytest.raises(ValueError, match="holds another sweep"):
+        dae_jax.sweep(Scaled(jnp.zeros(2)), np.ones(3), progress=False, store=tmp_path / "store")
+
+
+def test_whole_numbers_that_do_not_fit_are_refused():
+    """2⁴⁰ was 0 without 64 bits. In a context of the thread, which others that work have not."""
+    with jax.enable_x64(False):
+        assert dae_jax.sweep(lambda x: x, np.array([2**30]), progress=False) == 2**30
+        with pytest.raises(ValueError, match="hold whole numbers that int32 does not"):
+            dae_jax.sweep(lambda x: x, np.array([2**40]), progress=False)
+
+
+def test_keys_are_no_results():
+    with pytest.raises(TypeError, match="must return arrays of numbers, but returns keys"):
+        dae_jax.sweep(lambda key: jax.random.split(key), jax.random.split(jax.random.key(0), 3), progress=False)
 
 
 def test_a_folder_of_something_else_is_refused(tmp_path):
@@ -330,6 +392,32 @@ def test_reductions():
     np.testing.assert_array_equal(reductions.final_state(sol)[0], sol.ys[0][-1])
 
 
+def test_the_error_of_the_energy_at_one_time_alone_is_refused():
+    """It was 0 in every lane of a sweep that saves the end only, as a solve does by default."""
+    sol = dae_jax.daesolve(PENDULUM.system, diffrax.Tsit5(), 0.0, 2.0, 0.1, PENDULUM.y0)
+    with pytest.raises(
+        ValueError, match="`energy_error` compares the saved times with the first of them, and there is one"
+    ):
+        reductions.energy_error(PENDULUM.system, sol)
+
+
+@pytest.mark.parametrize("of", [lambda q, v: (q[0], v[0]), lambda q, v: (q[:, 0], v[:, 0]), lambda q, v: q])
+def test_a_reference_of_other_shapes_is_refused(of):
+    """Two times of a pendulum, of two coordinates, were compared with numbers along the wrong axis."""
+    sol = dae_jax.daesolve(
+        PENDULUM.system, PROJECTED, 0.0, 2.0, None, PENDULUM.y0, saveat=diffrax.SaveAt(t0=True, t1=True)
+    )
+    with pytest.raises(ValueError, match="must have the structure and the shapes of"):
+        reductions.largest_error(sol, of(*sol.ys))
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_first_time_is_that_in_the_order_of_the_solve(sign):
+    ts = sign * jnp.array([0.0, 1.0, 2.0, jnp.inf])
+    assert reductions.first_time(ts, jnp.array([False, True, True, False])) == sign
+    assert reductions.first_time(ts, jnp.zeros(4, bool)) == np.inf
+
+
 def test_first_flip_of_a_pendulum_that_turns_over():
     scene = dae_jax.scenes.pendulum(angle=0.0, angular_velocity=7.0)
     times = np.linspace(0, 2, 2001)
@@ -387,7 +475,8 @@ class TestOfASolveThatEndsEarly:
         assert np.isnan(reductions.lyapunov(*args, **FAILS))
 
     def test_largest_values_are_infinite(self):
-        sol = dae_jax.daesolve(PENDULUM.system, PROJECTED, 0.0, 2.0, None, PENDULUM.y0, **FAILS)
+        both = diffrax.SaveAt(t0=True, t1=True)
+        sol = dae_jax.daesolve(PENDULUM.system, PROJECTED, 0.0, 2.0, None, PENDULUM.y0, saveat=both, **FAILS)
         assert reductions.largest_drift(PENDULUM.system, sol) == np.inf
         assert reductions.energy_error(PENDULUM.system, sol) == np.inf
 

@@ -60,6 +60,33 @@ def test_the_first_of_many_starts_is_the_only_one_of_one():
     np.testing.assert_allclose(one.history.loss[0], many.history.loss[0], rtol=1e-12)
 
 
+@pytest.mark.parametrize(("unit", "constant"), [(1e-12, 0.0), (1e8, 0.0), (1.0, 1e6), (1e-12, -1e-6)])
+def test_a_loss_in_another_unit_is_the_same_loss(unit, constant):
+    """In the squares of micrometres the descent ended at 99.2, where it had hardly begun: settled by a tolerance of 1e-3."""
+    tuned = dae_jax.tune(lambda p: unit * jnp.log(p / 3.0) ** 2 + constant, 100.0, steps=200, progress=False)
+    np.testing.assert_allclose(tuned.params, 3.0, rtol=2e-2)
+
+
+def test_many_small_gains_are_a_gain():
+    """Of 5e-4 a step, half a tolerance: 0.015 in 30 steps."""
+    tuned = dae_jax.tune(lambda p: -jnp.log(p), 1.0, optax.scale(-5e-4), steps=200, progress=False)
+    np.testing.assert_allclose(tuned.loss, -0.0995, rtol=1e-9)
+
+
+def test_a_loss_that_falls_by_decades_goes_on():
+    """What is left is little beside what was gained in the first steps, and much beside what is to be had."""
+    loss = lambda p: 1e6 * jax.nn.relu(jnp.log(p) - 5) + jnp.abs(jnp.log(p))
+    tuned = dae_jax.tune(loss, jnp.exp(5.5), optax.sign_sgd(0.1), steps=70, progress=False)
+    assert tuned.loss < 0.1
+
+
+def test_what_is_no_positive_number_any_more_is_never_the_best():
+    """exp(710) is infinite, but log(exp(z)) is compiled to z: the best was at infinity."""
+    for sign in (1, -1):
+        tuned = dae_jax.tune(lambda p, sign=sign: -sign * jnp.log(p), 1.0, optax.sgd(30.0), steps=60, progress=False)
+        assert 0 < tuned.params < np.inf
+
+
 def test_plateau_ends_the_descent():
     tuned = dae_jax.tune(lambda p: 0 * p + 1.0, 2.0, steps=1000, progress=False)
     assert tuned.history.loss.shape[1] <= 40
@@ -110,6 +137,43 @@ def test_a_loss_that_is_finite_nowhere_is_refused():
 def test_a_loss_that_is_no_number_is_refused():
     with pytest.raises(ValueError, match="must return a real number"):
         dae_jax.tune(lambda p: p, jnp.ones(2), steps=1)
+
+
+@pytest.mark.parametrize("kind", [int, complex, bool])
+def test_a_loss_of_another_type_is_refused(kind):
+    with pytest.raises(ValueError, match=r"must return a real number, but returns .*\[\]"):
+        dae_jax.tune(lambda p: p.astype(kind), 2.0, steps=5)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"steps": 2.5}, "`steps` must be a whole number of at least 1, but is 2.5"),
+        ({"starts": 0}, "`starts` must be a whole number of at least 1, but is 0"),
+        ({"patience": -1}, "`patience` must be a whole number"),
+        ({"spread": 0.0}, "`spread` must be a factor of at least 1"),
+        ({"spread": np.nan}, "`spread` must be a factor of at least 1"),
+        ({"tolerance": np.nan}, "`tolerance` must be a part of the loss"),
+        ({"optimiser": 0.1}, "`optimiser` must be one of optax"),
+        ({"optimiser": optax.adam}, "`optimiser` must be one of optax"),
+        ({"key": 3}, "`key` must be one of"),
+        ({"params": {}}, "`params` must hold numbers"),
+        ({"params": 1j}, "must be positive and finite"),
+    ],
+    ids=str,
+)
+def test_wrong_options_are_refused(options, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        dae_jax.tune(**{"loss": lambda p: p, "params": 1.0, "steps": 5, **options})
+
+
+def test_what_is_traced_or_cannot_be_is_refused():
+    with pytest.raises(ValueError, match="`tune` looks at numbers"):
+        jax.jit(lambda p: dae_jax.tune(lambda x: x, p, steps=5, progress=False).params)(1.0)
+    with pytest.raises(ValueError, match="`tune` looks at numbers"):
+        jax.jit(lambda k: dae_jax.tune(lambda x: k * x, 1.0, steps=5, progress=False).params)(1.0)
+    with pytest.raises(ValueError, match="`loss` must be traceable by JAX, but makes numbers"):
+        dae_jax.tune(lambda p: float(p), 1.0, steps=5, progress=False)
 
 
 def test_progress_is_shown(capsys):
@@ -186,12 +250,24 @@ def test_nonholonomic_system_and_own_reference():
     np.testing.assert_allclose(loss(BAD_START), given(BAD_START), rtol=1e-5)
 
 
+def test_what_the_loss_is_not_for_is_refused(case):
+    with pytest.raises(ValueError, match="takes a ConstrainedSystem, but `system` is a SemiExplicitDAE"):
+        dae_jax.baumgarte_loss(SCENES["robertson"]().system, jnp.ones(2), 1.0, dt0=0.1)
+    for params in ({"alpha": 1.0}, {"alpha": 1.0, "beta": 1.0, "gamma": 1.0}):
+        with pytest.raises(ValueError, match="The parameters must be"):
+            case[0](params)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"dt0": -0.1}, "0 < dt0"),
         ({"dt0": 20.0}, "0 < dt0"),
         ({"dt0": 0.1, "times": 3}, "`times` must be at least"),
+        ({"dt0": 0.1, "times": 20.5}, "`times` must be at least"),
+        ({"dt0": "0.1"}, "`dt0` must be a real number"),
+        ({"dt0": 0.1, "weights": (1.0, 2.0)}, "`weights` must be three finite numbers"),
+        ({"dt0": 0.1, "weights": (1.0, 2.0, np.nan)}, "`weights` must be three finite numbers"),
         ({"dt0": 0.1, "reference": lambda t: (np.ones((2, 2)), np.ones((2, 2)))}, "`reference` must give"),
     ],
 )
