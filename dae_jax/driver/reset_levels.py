@@ -17,6 +17,8 @@ from ..types import Args, Scalar, State, Time, Y
 
 # Of a condition's terms, in units of their last digit: what may be round-off of it.
 ROUND_OFF = 1000
+# By so many tolerances a condition may be off on its way off zero.
+ERRORS = 100
 
 
 class FromStart(eqx.Module):
@@ -46,12 +48,13 @@ def level_at_start(
     rank: int | Rank | None,
     together: Scalar,
     moved: Scalar,
-    error: Scalar,
+    rtol: Scalar,
+    atol: Scalar,
 ) -> Any:
     """The condition at the start of a part; where this is zero, the sign with which it leaves zero, forwards or, with `sign` −1,
     backwards. That is the sign with which it came, −`before`, where its rate is not known. Zero is what the condition moves by
     while times are `together`, what may be round-off of the state in it, and, where it has `moved`, what it is off by: that and the
-    `error` of the state, relative to 1 and to it. And what it is off by, and for how long it may not have left zero by as much.
+    error of the state, relative to it and absolute. And what it is off by, and for how long it may not have left zero by as much.
     """
     value = jnp.asarray(condition(t, y, args))
     # The state as it is: one made anew from the underlying ODE is NaN where the structure allows what the numbers do not.
@@ -64,8 +67,8 @@ def level_at_start(
     round_off = ROUND_OFF * jnp.finfo(t.dtype).eps * jnp.where(jnp.isfinite(terms), terms, 0)
     # Where the state had to be made consistent it is off by its error, and will be: algebraic unknowns included.
     by_state = jax.grad(lambda y: jnp.asarray(condition(t, y, args), t.dtype))(y)
-    size = jax.tree.map(lambda slope, x: jnp.sum(jnp.abs(slope) * (1 + jnp.abs(x))), by_state, y)
-    off = jnp.where(moved > round_off, 2 * moved + error * sum(jax.tree.leaves(size)), 0)
+    error = jax.tree.map(lambda slope, x: jnp.sum(jnp.abs(slope) * (rtol * jnp.abs(x) + atol)), by_state, y)
+    off = jnp.where(moved > round_off, 2 * moved + ERRORS * sum(jax.tree.leaves(error)), 0)
     zero = jnp.abs(rate) * together + round_off + off
     leaves = (jnp.abs(value) <= zero) & (rate != 0)
     level = jnp.where(leaves, jnp.where(rate > 0, zero, -zero), value)

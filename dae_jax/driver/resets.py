@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
 # Entries of `stats` that do not add up over the parts of a solve.
 NO_COUNTS = ("max_steps", "end_time")
-# By so many tolerances a condition may be off on its way off zero; for no more than this part of the solve's interval.
-ERRORS, SAME = 100, 1e-3
+# A condition may be on its way off zero for no more than this part of the solve's interval.
+SAME = 1e-3
 
 
 class Reset(eqx.Module):
@@ -137,13 +137,12 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Any]:
     # In which the order of resets is round-off.
     together = 16 * float(jnp.finfo(t0.dtype).eps) ** 0.75 * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
     tolerances = [jnp.max(jnp.asarray(getattr(solve.controller, x, 0.0), t0.dtype)) for x in ("rtol", "atol")]
-    error = ERRORS * jnp.maximum(*tolerances)
     going = int(RESULTS.event_occurred._value)
 
     def part(p: _Progress) -> tuple[DAESolution, Any]:
         args = eqx.combine(p.args, others)
         level, off, near = level_at_start(
-            system, reset.condition, sign, p.t, p.y, args, p.level, rank, together, p.moved, error
+            system, reset.condition, sign, p.t, p.y, args, p.level, rank, together, p.moved, *tolerances
         )
         near = jnp.minimum(near, SAME * jnp.abs(t1 - t0))
         # A downcrossing, as bisection has to know which way it goes.

@@ -65,10 +65,10 @@ class Index1Form(eqx.Module):
 
     def decode(self, t: Time, z: Float[Array, " z"]) -> Any:
         """The state in the user's structure, with H(t, Y) = 0 to round-off: the steps, and more so the values between them, leave
-        a part of the tolerance.
+        a part of the tolerance. Dummy derivatives move, as a nearest point depends on the unit of time.
         """
         form, y = self.ode.form, z[: self.ode.orders.size]
-        on, found = self.ode.project(t, y)
+        on, found = self.ode.retract_along(t, y, self.ode.selection(t, y, None)[0])
         settled = jnp.concatenate([jnp.where(found, on, y), z[y.size :]])
         return form.decode(t, take(settled, self.ode.orders.places[0][: form.layout.size]))
 

@@ -430,3 +430,25 @@ def test_one_crossing_is_one_reset(solver, name, direction):
         sol = dae_jax.daesolve(dae_jax.ImplicitDAE(equations), solver(), 0.0, 3.0, None, start, **options)
         assert sol.stats["jumps"] == len(exact)
         assert np.abs(sol.stats["jump_times"][: len(exact)] - exact).max() < 10 * tolerance
+
+
+@pytest.mark.parametrize("length", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("solver", [dae_jax.RadauIIA5(), dae_jax.BDF(), diffrax.Tsit5()], ids=["radau", "bdf", "tsit"])
+def test_resets_know_no_unit_of_length(solver, length):
+    """A ball that falls by its length in 1 s, three times, and is held then for long; z, which says when it lands, is algebraic."""
+
+    def falling(t, y, yd, left):
+        h, v, z = y / length
+        return jnp.stack([yd[0] / length - v, yd[1] / length + jnp.where(left > 0, 2.0, 0.0), z + z**3 - h])
+
+    def bounce(t, y, left):
+        return jnp.where(left > 1, y.at[1].multiply(-1.0), start), left - 1
+
+    start = length * jnp.array([1.0, 0.0, 0.6823278038280193])
+    event = dae_jax.Reset(lambda t, y, left, **_: y[2], bounce, direction=False)
+    controller = diffrax.PIDController(rtol=1e-4, atol=1e-4 * length)
+    options = {"stepsize_controller": controller, "event": event}
+    sol = dae_jax.daesolve(dae_jax.ImplicitDAE(falling), solver, 0.0, 4000.0, None, start, 3.0, **options)
+    assert sol.stats["jumps"] == 3
+    np.testing.assert_allclose(sol.stats["jump_times"][:3], [1.0, 3.0, 5.0], rtol=3e-4)
+    np.testing.assert_allclose(sol.final[0], length, rtol=1e-6)

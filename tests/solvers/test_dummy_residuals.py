@@ -116,3 +116,20 @@ def test_derivatives_through_a_switch():
     np.testing.assert_allclose(forward, (high - low) / (2 * h), rtol=1e-4)
     reverse = jax.grad(lambda a: end(a, diffrax.RecursiveCheckpointAdjoint())[0])(1.2)
     np.testing.assert_allclose(reverse, forward, rtol=1e-8)
+
+
+def test_on_the_constraints_whatever_the_unit_of_time():
+    """Of index 4: u is given, the next follow by ẏ + sin(y)/4. In a nearest point they are as far off as derivatives are large."""
+    unit, chain = 1e-6, [lambda t: jnp.sin(2e6 * t) + jnp.cos(1e6 * t) / 2]
+    next_of = lambda y: lambda t: jax.jvp(y, (t,), (jnp.asarray(unit),))[1] + jnp.sin(y(t)) / 4
+    for _ in range(3):
+        chain.append(next_of(chain[-1]))
+    exact = lambda t: jnp.stack([y(t) for y in chain])
+
+    def equations(t, y, yd, args):
+        u = chain[0](t)
+        return jnp.concatenate([unit * yd[:3] + jnp.sin(y[:3]) / 4 - y[1:], y[:1] + y[:1] ** 3 / 5 - u - u**3 / 5])
+
+    system, start, ts = dae_jax.ImplicitDAE(equations), exact(jnp.asarray(0.0)), unit * jnp.linspace(0, 2, 23)
+    sol = solved(system, dae_jax.RadauIIA5(), 2 * unit, start, 1e-6, saveat=diffrax.SaveAt(ts=ts))
+    np.testing.assert_allclose(sol.ys[:, :3], jax.vmap(exact)(ts)[:, :3], atol=1e-13)
