@@ -254,8 +254,8 @@ def corrected(
     eta: Any,
     tol: Tolerances,
 ) -> Newton:
-    """One correction x + λ Δx from where F is `off`, in the first tries with λ the largest power of ½ with which the next correction by the same
-    matrix is smaller, ‖Δx̄‖ ≤ (1 − λ/2) ‖Δx‖; then a whole one. Converged where it is whole and the next one is small;
+    """One correction x + λ Δx from where F is `off`, in the first tries with λ the largest power of ½ with which the next correction by
+    the same matrix is smaller, ‖Δx̄‖ ≤ (1 − λ/2) ‖Δx‖; then a whole one. Converged where it is whole and the next one is small;
     `scale(x)` is what a correction counts near x.
 
     Source: P. Deuflhard, *Newton Methods for Nonlinear Problems*, sec. 3.1.4 (the restricted monotonicity test).
