@@ -160,7 +160,6 @@ def test_a_loss_of_another_type_is_refused(kind):
         ({"params": {}}, "`params` must hold numbers"),
         ({"params": 1j}, "must be positive and finite"),
     ],
-    ids=str,
 )
 def test_wrong_options_are_refused(options, message):
     with pytest.raises((TypeError, ValueError), match=message):
