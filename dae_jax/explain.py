@@ -263,7 +263,7 @@ def explain(
         coordinates=ode.layout.size,
         constraints=count,
         independent=None if traced else given.rank[1] if given.rank else count,
-        mass=_mass(system, ode.mass(ode.encode(y0)[0])),
+        mass=_mass(system, given.mass(given.encode(y0)[0])),
         constraints_depend_on_time=any(ode.depends_on_time),
         nonzeros=None if sparse is None else int((sparse.columns >= 0).sum()),
         colours=None if sparse is None else len(sparse.columns),

@@ -94,7 +94,10 @@ def test_one_correction_does_not_count_as_a_solution_because_the_step_before_con
     tol = tolerances(1e-6, 1e-6, jnp.float64)._replace(corrections=50)
     # The matrix is of another regime: half the error is left by each correction.
     half_way = Iteration(lambda x: x - 1, lambda off: -off / 2, lambda off: off, jnp.zeros(1))
-    found = simplified_newton(half_way, jnp.array([1e-3]), 1 / tol.scale(jnp.ones(1)), jnp.asarray(1e-12), tol)
+    start = jnp.array([1e-3])
+    found = simplified_newton(
+        half_way, start, half_way.residual(start), 1 / tol.scale(jnp.ones(1)), jnp.asarray(1e-12), tol
+    )
     assert found.converged
     assert abs(float(found.x[0]) - 1) < 1e-7
 
