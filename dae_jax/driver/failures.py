@@ -175,7 +175,7 @@ def _passed(
     start: list[Array],
 ) -> Any:
     shapes = jax.eval_shape(lambda: arrays)
-    fail = lambda: jax.pure_callback(_raise, shapes, off(start), *details, vmap_method="expand_dims")
+    fail = lambda: jax.pure_callback(_raise_of, shapes, off(start), *details, vmap_method="expand_dims")
     return lax.cond(unvmap_any(failed), fail, lambda: arrays)
 
 
@@ -187,17 +187,13 @@ def _(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
 
 def refused_on_the_way(steps: Steps, most: int) -> Steps:
     """The steps of a derivative, at most so many, in a program in which it raises a `SolveFailed` where they do not lead to the end."""
-    fail = lambda: jax.pure_callback(functools.partial(_raise_of_derivative, most), jnp.zeros((), int))
-    none = lax.cond(unvmap_any(~reach(of_bits(steps))), fail, lambda: jnp.zeros((), int))
-    return steps._replace(times=steps.times.at[0].add(none.astype(steps.times.dtype)))
-
-
-def _raise_of_derivative(most: int) -> Any:
-    logging.getLogger(CALLBACK_LOG).addFilter(_without_ours)
-    raise SolveFailed(
-        f"The derivative of a solve is not known: its steps, which are shorter than those of the solution where it needs that, do not "
+    sentence = (
+        "The derivative of a solve is not known: its steps, which are shorter than those of the solution where it needs that, do not "
         f"lead to the end. Raise `max_steps`, which is {most}. With `throw=False` the derivative is NaN instead."
     )
+    fail = lambda: jax.pure_callback(functools.partial(_raise, sentence), jnp.zeros((), int))
+    none = lax.cond(unvmap_any(~reach(of_bits(steps))), fail, lambda: jnp.zeros((), int))
+    return steps._replace(times=steps.times.at[0].add(none.astype(steps.times.dtype)))
 
 
 def _off(program: Program, numbers: list[Array]) -> Violation | None:
@@ -210,10 +206,14 @@ def _off(program: Program, numbers: list[Array]) -> Violation | None:
     return jax.tree.map(jnp.asarray, violation(ode, t, ode.encode(state)))
 
 
-def _raise(off: Violation | None, *details: Array | np.ndarray) -> Any:
+def _raise_of(off: Violation | None, *details: Array | np.ndarray) -> Any:
+    _raise(_sentence(tuple(map(np.asarray, details)), off))
+
+
+def _raise(sentence: str | None) -> Any:
     # JAX would print the traceback of this function before the error that has it.
     logging.getLogger(CALLBACK_LOG).addFilter(_without_ours)
-    raise SolveFailed(_sentence(tuple(map(np.asarray, details)), off))
+    raise SolveFailed(sentence)
 
 
 def _without_ours(record: logging.LogRecord) -> bool:

@@ -13,22 +13,19 @@ from ..types import BoolScalar, Y
 ALLOWED = 10
 
 
-def felt(error: Y, y0: Y, y1: Y, counts: BoolScalar, rtol: Any, atol: Any) -> Y:
+@jax.custom_jvp
+def felt(error: Y, y0: Y, y1: Y, counts: BoolScalar, rtol: Any, atol: Any) -> Y:  # noqa: ARG001
     """The error of a step from y₀ to y₁. Under forward derivatives it is, where that is more and `counts`,
     δerror (s + |y|) / (ALLOWED |δy|), s = min(1, atol/rtol): of an absolute tolerance that is small beside the relative one, for
     variables that are small, a derivative knows nothing.
     """
-    return _felt(error, y0, y1, counts, lax.stop_gradient(jnp.minimum(1, atol / jnp.asarray(rtol))))
-
-
-@jax.custom_jvp
-def _felt(error: Y, y0: Y, y1: Y, counts: BoolScalar, least: Any) -> Y:  # noqa: ARG001
     return error
 
 
-@_felt.defjvp
-def _(primals: tuple[Y, Y, Y, BoolScalar, Any], tangents: tuple[Y, Y, Y, Any, Any]) -> Any:
-    error, y0, y1, counts, least = primals
+@felt.defjvp
+def _(primals: tuple[Y, Y, Y, BoolScalar, Any, Any], tangents: tuple[Y, Y, Y, Any, Any, Any]) -> Any:
+    error, y0, y1, counts, rtol, atol = primals
+    least = jnp.minimum(1, atol / jnp.asarray(rtol))
     largest = lambda *trees: jnp.max(jnp.stack([jnp.max(jnp.abs(x), initial=0.0) for x in jax.tree.leaves(trees)]))
     size = largest(tangents[1], tangents[2])
     relative = 1 / (ALLOWED * jnp.where(size > 0, size, 1))
