@@ -1,4 +1,4 @@
-"""All of JAX, XLA and equinox that the compiler leans on without being promised it.
+"""All of JAX, XLA, equinox and llvmlite that the compiler leans on without being promised it.
 
 Beside it XLA's interface for foreign functions, which has a version (`emit/interface.py`).
 """
@@ -100,3 +100,10 @@ def check_messages(eqn: Equation) -> list[str] | None:
     """The messages of such a call, one of which it raises, by its only operand; `None` where they are not found."""
     messages = inspect.getclosurevars(eqn.params["callback"].callback_func).nonlocals.get("msgs")
     return list(messages) if messages is not None and len(eqn.invars) == 1 else None
+
+
+def without_lock(function: Any) -> Any:
+    """A function of LLVM's without the lock by which llvmlite lets one thread at a time into LLVM. It may work on a module in a context
+    of its own while other threads work on theirs.
+    """
+    return getattr(function, "_cfn", function)

@@ -5,7 +5,7 @@ import dataclasses
 from jax.extend.core import ClosedJaxpr
 
 from . import lower
-from .emit.object_code import object_code
+from .emit.object_code import object_code, verified
 from .emit.target import host
 from .jaxprs.scalar_interpreter import Unsupported
 from .jaxprs.walk import equations
@@ -62,7 +62,7 @@ class Lowered:
     def assembly(self) -> str:
         """The machine code in words. Errors: as `ir`."""
         found: dict[str, str] = {}
-        object_code(self.ir(), host(), current().optimise, show=found.__setitem__)
+        object_code(verified(self.ir(), host(), current().optimise), show=found.__setitem__)
         return found["s"]
 
     def __repr__(self) -> str:

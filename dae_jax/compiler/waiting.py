@@ -5,6 +5,8 @@ import sys
 import threading
 import time
 
+from .emit import background
+
 
 # Seconds after which somebody wants to know.
 DELAY = 2.0
@@ -35,11 +37,13 @@ def begin(always: bool = False) -> bool:
     return True
 
 
-def end() -> float:
-    """Seconds since `begin`; 0 where nothing was begun."""
+def end(all_made: bool = False) -> float:
+    """Seconds since `begin`, with those until all machine code is there where it is to be `all_made`; 0 where nothing was begun."""
     notice = getattr(_of_thread, "notice", None)
     if notice is None:
         return 0.0
+    if all_made:
+        background.finish()
     _of_thread.notice = None
     notice.cancel()
     with _lock:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dae_jax.compiler import one_kernel
-from dae_jax.compiler.emit import object_cache, object_code, programs, register, target
+from dae_jax.compiler.emit import object_cache, object_code, programs, register, self_test, target
 from dae_jax.compiler.lower.module import written
 from dae_jax.compiler.settings import configure
 from tests.compiler.samples import X, numbered
@@ -23,6 +23,7 @@ class TestLeastRecentlyUsed:
             fn, _ = numbered(100.0 + k)
             call = jax.jit(one_kernel(fn, "forward")).lower(X).compile()
             calls.append((call, np.asarray(fn(X))))
+            np.testing.assert_allclose(call(X), calls[-1][1], rtol=1e-14)
         own = list(programs._programs.values())[-6:]
         monkeypatch.setattr(programs, "BOUND", 2 * (own[0].size + programs.ENGINE))
         for call, expected in calls * 3:
@@ -33,6 +34,8 @@ class TestLeastRecentlyUsed:
 
     def test_the_last_used_stay(self, monkeypatch):
         calls = [jax.jit(one_kernel(numbered(200.0 + k)[0], "forward")).lower(X).compile() for k in range(3)]
+        for call in calls:
+            jax.block_until_ready(call(X))
         own = list(programs._programs.values())[-3:]
         jax.jit(one_kernel(numbered(210.0)[0], "forward"))(X)
         jax.block_until_ready(calls[0](X))
@@ -46,12 +49,27 @@ class TestLeastRecentlyUsed:
         """A call that is counted keeps the code, whoever wants it gone."""
         name = register(written(jax.make_jaxpr(lambda x: x * 17)(X)))
         program = programs._programs[name]
+        assert program.engine is None
+        assert programs._load_again(program.slot)
         running = ctypes.c_int64.from_address(program.slot + 8)
         running.value += 1
         assert not programs.runtime().release(program.slot)
         running.value -= 1
         assert programs.runtime().release(program.slot)
         programs.runtime().fill(program.slot, program.engine.get_function_address(f"{name}.kernel"))
+
+    def test_code_that_cannot_be_made_is_an_error_of_the_call(self, monkeypatch, caplog):
+        """As LLVM says it; a module that is broken has been refused before."""
+
+        def fails(_):
+            raise RuntimeError("LLVM makes no machine code of a module: for a reason of its own")
+
+        assert self_test.available()
+        monkeypatch.setattr(programs, "object_code", fails)
+        fn, _ = numbered(400.0)
+        with pytest.raises(jax.errors.JaxRuntimeError, match="could not be loaded"):
+            jax.block_until_ready(jax.jit(one_kernel(fn, "forward"))(X))
+        assert "for a reason of its own" in caplog.text
 
     def test_threads_that_call_what_others_let_go(self, monkeypatch):
         monkeypatch.setattr(programs, "BOUND", 1)
@@ -80,27 +98,27 @@ class TestObjectCodeOnDisk:
     TEXT = "define i64 @f() {\nret i64 7\n}"
 
     def test_it_is_kept_and_taken(self, cache, monkeypatch):
-        code = programs.compiled(self.TEXT, target.host())
+        code = programs.compiled(self.TEXT, target.host()).result()
         (file,) = cache.iterdir()
         assert file.stat().st_mode & 0o777 == 0o600
         assert cache.stat().st_mode & 0o777 == 0o700
         monkeypatch.setattr(programs, "object_code", lambda *_: pytest.fail("compiled again"))
-        assert programs.compiled(self.TEXT, target.host()) == code
+        assert programs.compiled(self.TEXT, target.host()).result() == code
 
     @pytest.mark.parametrize(
         "harm", [lambda b: b[:-1], lambda b: b[:99] + b"x" + b[100:], lambda b: b"", lambda b: b[20:]]
     )
     def test_a_damaged_file_is_compiled_again(self, cache, harm):
-        code = programs.compiled(self.TEXT, target.host())
+        code = programs.compiled(self.TEXT, target.host()).result()
         (file,) = cache.iterdir()
         whole = file.read_bytes()
         file.write_bytes(harm(whole))
-        assert programs.compiled(self.TEXT, target.host()) == code
+        assert programs.compiled(self.TEXT, target.host()).result() == code
         assert file.read_bytes() == whole
 
     @pytest.mark.parametrize("mode", [0o777, 0o770, 0o720])
     def test_a_folder_that_others_can_write_to_is_not_used(self, cache, mode):
-        programs.compiled(self.TEXT, target.host())
+        programs.compiled(self.TEXT, target.host()).result()
         (file,) = cache.iterdir()
         cache.chmod(mode)
         assert object_cache.load(file.stem) is None
@@ -110,7 +128,7 @@ class TestObjectCodeOnDisk:
         assert object_cache.load(file.stem) is None
 
     def test_links_are_not_followed(self, cache, tmp_path):
-        programs.compiled(self.TEXT, target.host())
+        programs.compiled(self.TEXT, target.host()).result()
         (file,) = cache.iterdir()
         moved = file.rename(tmp_path / "moved.o")
         file.symlink_to(moved)

@@ -101,7 +101,7 @@ class TestTargets:
         assert "_ZGV" not in text or "linux" in triple
         own = {"malloc", "free", runtime.SHARE, runtime.HANDLE, "memset", "memcpy", "memmove", "bzero"}
         for module_text, passes in ((text, True), (runtime.text(), False), (runtime.stubs(), False)):
-            code = object_code.object_code(module_text, other, passes)
+            code = object_code.object_code(object_code.verified(module_text, other, passes))
             assert len(code) > 500
             declared = set(re.findall(r"^declare \S+ @([\w.]+)", module_text, re.MULTILINE))
             called = {name for name in declared if not name.startswith("llvm.")}

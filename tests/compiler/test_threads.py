@@ -10,9 +10,10 @@ import jax
 import numpy as np
 import pytest
 
-from dae_jax.compiler import fallbacks, kernel_call, one_kernel
+from dae_jax.compiler import _compat, fallbacks, kernel_call, one_kernel
 from dae_jax.compiler.emit import object_code, programs, target
 from dae_jax.compiler.jaxprs.scalar_interpreter import Unsupported
+from dae_jax.compiler.lower import written
 from dae_jax.compiler.settings import configure
 from tests.compiler.samples import X, in_a_program, numbered, slow
 
@@ -194,8 +195,64 @@ class TestForks:
         )
         assert out == "0 True"
 
+    def test_a_fork_while_code_is_made(self):
+        """The child has no thread that would go on with it, and makes its own later."""
+        out = in_a_program(
+            "import warnings; warnings.simplefilter('ignore')\n"
+            "jax.config.update('jax_cpu_enable_async_dispatch', False)\n"
+            "from dae_jax.compiler.emit.target import host\n"
+            "available()\n"
+            "expected = float(jax.jit(loop)(1.5))\n"
+            "made = programs.object_code\n"
+            "programs.object_code = lambda module: __import__('time').sleep(0.5) or made(module)\n"
+            "begun = jax.jit(one_kernel(loop, 'forward')).lower(1.5).compile()\n"
+            "child = os.fork()\n"
+            "if not child:\n"
+            "    right = float(begun(1.5)) == expected and programs.compiled('define i64 @f() {\\nret i64 8\\n}', host()).result()\n"
+            "    os._exit(0 if right else 1)\n"
+            "print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), begun(1.5) == expected)"
+        )
+        assert out == "0 True"
+
 
 class TestCompiling:
+    def test_llvm_works_while_another_thread_is_in_it(self, monkeypatch):
+        """The two steps that take long do without llvmlite's lock."""
+        lock, free = target.llvm().ffi.lib._lock, []
+
+        def watched(function):
+            """The function, called while another thread has the lock."""
+
+            def call(*args):
+                taken, returned = threading.Event(), threading.Event()
+
+                def hold():
+                    with lock:
+                        taken.set()
+                        free.append(returned.wait(20))
+
+                other = threading.Thread(target=hold)
+                other.start()
+                taken.wait()
+                result = _compat.without_lock(function)(*args)
+                returned.set()
+                other.join()
+                return result
+
+            return call
+
+        monkeypatch.setattr(object_code, "without_lock", watched)
+        assert object_code.object_code(object_code.verified("define i64 @f() {\nret i64 7\n}", target.host()))
+        assert free == [True, True]
+
+    def test_modules_become_code_in_many_threads(self):
+        """The same code as one after another."""
+        texts = [written(jax.make_jaxpr(numbered(500.0 + k)[0])(X)).replace("{name}", f"f{k}") for k in range(8)]
+        code = lambda text: object_code.object_code(object_code.verified(text, target.host()))
+        expected = list(map(code, texts))
+        with ThreadPoolExecutor(8) as pool:
+            assert list(pool.map(code, texts * 4)) == expected * 4
+
     def test_eight_threads_compile_at_once(self):
         fns = [numbered(0.01 * k)[0] for k in range(8)]
 
@@ -210,7 +267,7 @@ class TestCompiling:
         """LLVM's passes would end the process: a branch on a number that is defined in no block before it."""
         broken = "define i64 @f(i1 %c) {\nentry:\nbr i1 %c, label %a, label %b\na:\n%x = add i64 1, 2\nbr label %b\nb:\nret i64 %x\n}"
         with pytest.raises(Unsupported, match="LLVM"):
-            object_code.object_code(broken, target.host())
+            object_code.verified(broken, target.host())
 
     def test_what_is_given_up_is_said_once(self, monkeypatch, caplog):
         def gives_up(*_, **__):

@@ -1,11 +1,13 @@
 """Object code for a target from a module of LLVM's intermediate representation."""
 
+import ctypes
 import hashlib
 import importlib.metadata
 import re
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+from .._compat import without_lock
 from ..jaxprs.scalar_interpreter import Unsupported
 from .interface import VERSION
 from .target import SPLITTING, Target, llvm
@@ -62,27 +64,37 @@ def key(text: str, target: Target, optimise: bool) -> str:
     return hashlib.sha256(repr(made).encode()).hexdigest()
 
 
-def object_code(
-    text: str, target: Target, optimise: bool = True, show: Callable[[str, str], None] | None = None
-) -> bytes:
-    """Machine code of a module; with `optimise=False` it is made in the least time. `show` gets the intermediate representation after
-    the passes, and the assembly.
+class Module(NamedTuple):
+    """A module that is not broken, the machine that it is for, and whether LLVM's passes run over it."""
+
+    ir: "ModuleRef"
+    machine: "TargetMachine"
+    passes: bool
+
+
+def verified(text: str, target: Target, optimise: bool = True) -> Module:
+    """A module that can become machine code; with `optimise=False` in the least time.
 
     Errors: `Unsupported` for a module that is broken.
     """
     passes = optimise and _gains_by_passes(text)
-    machine = target.machine(3 if passes else int(optimise))
     try:
-        module = parsed(text)
-        if passes:
-            _optimise(module, machine)
+        return Module(parsed(text), target.machine(3 if passes else int(optimise)), passes)
     except RuntimeError as error:
         raise Unsupported(f"LLVM: {error}") from error
+
+
+def object_code(module: Module, show: Callable[[str, str], None] | None = None) -> bytes:
+    """Machine code; may run in several threads at once, each with a module of its own. `show` gets the intermediate representation
+    after the passes, and the assembly.
+    """
+    if module.passes:
+        _optimise(module)
     if show is not None:
-        show("optimised.ll", str(module))
+        show("optimised.ll", str(module.ir))
         # A module of its own: making assembly changes it.
-        show("s", machine.emit_assembly(parsed(str(module))))
-    return machine.emit_object(module)
+        show("s", module.machine.emit_assembly(parsed(str(module.ir))))
+    return _emitted(module)
 
 
 def _gains_by_passes(text: str) -> bool:
@@ -101,9 +113,22 @@ def parsed(text: str) -> Any:
     return module
 
 
-def _optimise(module: "ModuleRef", machine: "TargetMachine") -> None:
+def _optimise(module: Module) -> None:
     tuning = llvm().create_pipeline_tuning_options(speed_level=SPEED)
     for name, value in TUNING.items():
         setattr(tuning, name, value)
-    passes = llvm().create_pass_builder(machine, tuning)
-    passes.getModulePassManager().run(module, passes)
+    passes = llvm().create_pass_builder(module.machine, tuning)
+    run = without_lock(llvm().ffi.lib.LLVMPY_RunNewModulePassManager)
+    run(passes.getModulePassManager(), module.ir, passes)
+
+
+def _emitted(module: Module) -> bytes:
+    lib = llvm().ffi.lib
+    with llvm().ffi.OutputString() as said:
+        found = without_lock(lib.LLVMPY_TargetMachineEmitToMemory)(module.machine, module.ir, 1, said)
+        if not found:
+            raise RuntimeError(f"LLVM makes no machine code of a module: {said}")
+    try:
+        return ctypes.string_at(lib.LLVMPY_GetBufferStart(found), lib.LLVMPY_GetBufferSize(found))
+    finally:
+        lib.LLVMPY_DisposeMemoryBuffer(found)

@@ -1,13 +1,17 @@
-"""Compiled functions in this process: each is loaded when it is called, and let go when others have taken its room."""
+"""Compiled functions in this process: each is made beside what goes on, loaded when it is called, and let go when others have taken its
+room.
+"""
 
 import ctypes
 import dataclasses
 import functools
 import hashlib
+import logging
 import os
 import tempfile
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +19,8 @@ import jax
 from jaxtyping import Array
 
 from ..settings import THREADS, current
-from . import host_functions, object_cache
-from .object_code import key, object_code, parsed
+from . import background, host_functions, object_cache
+from .object_code import key, object_code, parsed, verified
 from .runtime import HANDLE, SHARE, STUBS, stubs, text as shared
 from .target import Target, host, llvm
 
@@ -25,21 +29,30 @@ from .target import Target, host, llvm
 BOUND = 64 * 2**20
 ENGINE = 150_000
 
+_log = logging.getLogger(__name__)
 _lock = threading.RLock()
-# A child process finds the lock free.
-os.register_at_fork(before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_lock.release)
 _programs: dict[str, "_Program"] = {}
+
+
+def _before_fork() -> None:
+    _lock.acquire()
+    background.finish()
+
+
+# A child process finds the lock free, and all that was begun.
+os.register_at_fork(before=_before_fork, after_in_parent=_lock.release, after_in_child=_lock.release)
 
 
 @dataclasses.dataclass
 class _Program:
-    """A function: where it is entered, its object code in the spill file, and what is loaded of it."""
+    """A function: where it is entered, its object code, which is being made until it is in the spill file, and what is loaded of it."""
 
     name: str
     slot: int
     handler: Any
-    size: int
-    place: tuple[Any, int] | None
+    making: Future[bytes] | None
+    size: int = 0
+    place: tuple[Any, int] | None = None
     engine: Any = None
 
     @property
@@ -48,7 +61,7 @@ class _Program:
 
 
 def register(module: str, source: object = None) -> str:
-    """Compiles a module with a function `{name}.kernel`, and gives the name by which XLA calls it.
+    """Begins to compile a module with a function `{name}.kernel`, and gives the name by which XLA calls it.
 
     `source` is what the module was written from, for people to read where the settings ask for a dump.
 
@@ -64,11 +77,9 @@ def register(module: str, source: object = None) -> str:
         if source is not None and current().dump is not None:
             _dump(text, target, name, source)
         if name not in _programs:
-            code = compiled(text, target, optimise)
-            slot, handler = _entrance()
-            program = _Program(name, slot, handler, len(code), _spilled(code))
-            _load(program, code)
-            jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler), platform="cpu")
+            making = compiled(text, target, optimise)
+            program = _Program(name, *_entrance(), making)
+            jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(program.handler), platform="cpu")
             _programs[name] = program
     return name
 
@@ -89,14 +100,26 @@ def guarded(fn: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-def compiled(text: str, target: Target, optimise: bool = True) -> bytes:
-    """Object code, from the cache on disk where that has it."""
+def compiled(text: str, target: Target, optimise: bool = True) -> Future[bytes]:
+    """Object code, from the cache on disk where that has it, else when it is made.
+
+    Errors: `Unsupported` for a module that is broken.
+    """
     made_of = key(text, target, optimise)
     code = object_cache.load(made_of)
     if code is None:
-        code = object_code(text, target, optimise)
-        object_cache.keep(made_of, code)
-    return code
+        modules = [verified(text, target, optimise)]
+
+        def make() -> bytes:
+            # The module is gone before the code is there: a fork then finds no thread in LLVM.
+            code = object_code(modules.pop())
+            object_cache.keep(made_of, code)
+            return code
+
+        return background.begin(make)
+    found: Future[bytes] = Future()
+    found.set_result(code)
+    return found
 
 
 def _dump(text: str, target: Target, name: str, source: object) -> None:
@@ -107,7 +130,7 @@ def _dump(text: str, target: Target, name: str, source: object) -> None:
 
     show("jaxpr", str(source))
     show("ll", text)
-    object_code(text, target, current().optimise, show=show)
+    object_code(verified(text, target, current().optimise), show=show)
 
 
 def engine(code: bytes, target: Target) -> Any:
@@ -123,7 +146,7 @@ class Runtime:
 
     def __init__(self) -> None:
         target = host()
-        self.engine = engine(compiled(shared(), target, optimise=False), target)
+        self.engine = engine(compiled(shared(), target, optimise=False).result(), target)
         address = self.engine.get_function_address
         for name in (HANDLE, SHARE):
             llvm().add_symbol(name, address(name))
@@ -138,7 +161,7 @@ class Runtime:
         ):
             ctypes.c_void_p.from_address(self.engine.get_global_value_address(name)).value = value
         os.register_at_fork(after_in_child=ctypes.CFUNCTYPE(None)(address("forked")))
-        self.stubs = compiled(stubs(), target, optimise=False)
+        self.stubs = compiled(stubs(), target, optimise=False).result()
         self.entrances: list[tuple[int, Any]] = []
 
 
@@ -181,18 +204,37 @@ def _load(program: _Program, code: bytes) -> None:
 
 
 def _load_again(slot: int) -> int:
-    """Called by the handler of a program whose code was let go; 0 where it cannot be loaded."""
+    """Called by the handler of a program whose code is not loaded, or no more; 0 where it cannot be."""
+    program = next((p for p in list(_programs.values()) if p.slot == slot), None)
+    if program is None:
+        return 0
+    making = program.making
+    # Others go on meanwhile.
+    wrong = None if making is None else making.exception()
+    if wrong is not None:
+        # What is raised in here would be lost.
+        _log.error("%s could not be compiled: %r", program.name, wrong)
+        return 0
     with _lock:
-        program = next((p for p in _programs.values() if p.slot == slot), None)
-        if program is None or program.place is None:
-            return 0
         if program.engine is None:
-            file, start = program.place
-            code = os.pread(file.fileno(), program.size, start)
-            if len(code) < program.size:
+            code = _code(program)
+            if code is None:
                 return 0
             _load(program, code)
     return 1
+
+
+def _code(program: _Program) -> bytes | None:
+    """The object code of a program that is not loaded; `None` where it cannot be read."""
+    if program.making is not None:
+        code = program.making.result()
+        program.size, program.place, program.making = len(code), _spilled(code), None
+        return code
+    if program.place is None:
+        return None
+    file, start = program.place
+    code = os.pread(file.fileno(), program.size, start)
+    return code if len(code) == program.size else None
 
 
 # Where the object code of this process is kept: files without a name, which end with the process.

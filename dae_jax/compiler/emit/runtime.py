@@ -168,5 +168,5 @@ _NUMBERS = {
     "SAYS_STAGE": _said("dae_jax: a compiled function was called in a wrong stage"),
     "SAYS_FRAME": _said("dae_jax: XLA's call frame is smaller than that of its interface"),
     "SAYS_MEMORY": _said("dae_jax: there is not enough memory for the arrays of a compiled function"),
-    "SAYS_CODE": _said("dae_jax: the code of a compiled function could not be loaded again"),
+    "SAYS_CODE": _said("dae_jax: the code of a compiled function could not be loaded"),
 }  # fmt: skip
