@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from ..equations.manifold_ode import constant
 from ..formulations import AbstractFormulation
-from ..solvers.residual_steps import constant
 from ..solvers.wrapping import AbstractWrapper
 from ..types import Args, BoolLike, Scalar, Time, Y
 

@@ -19,11 +19,11 @@ from jaxtyping import Array, PyTree
 from .._compat import CALLBACK_LOG, messages, unvmap_any
 from ..consistent import Violation, violation
 from ..equations.linearised import LinearisedResidual
+from ..equations.manifold_ode import constant
 from ..equations.mechanical import MechanicalODE
 from ..equations.residual_form import ResidualForm
 from ..equations.singular_block import singular_block
 from ..solution import RESULTS, DAESolution
-from ..solvers.residual_steps import constant
 from ..systems import is_mechanism
 from ..types import BoolScalar
 from ..validate.user_functions import not_finite

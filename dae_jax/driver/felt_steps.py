@@ -15,6 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.extend.core import jaxpr_as_fun
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
@@ -93,13 +94,15 @@ def by_felt_steps(solved: Callable[[Any], tuple[Steps, BoolScalar]], given: Any,
     none leads to the end. Where a function of the user has a derivative in reverse only, a rule of its own, they are those of the
     solution.
     """
-    jaxpr, (shapes, _) = jax.make_jaxpr(solved, return_shape=True)(given)
+    jaxpr, out = jax.make_jaxpr(solved, return_shape=True)(given)
+    shapes, tree = out[0], jax.tree.structure(out)
+    traced = lambda given: jax.tree.unflatten(tree, jaxpr_as_fun(jaxpr)(*jax.tree.leaves(given)))
     one_way = any(eqn.primitive.name.startswith("custom_vjp") for eqn in equations(jaxpr))
 
     # What is refused the solution refuses, too; in a loop it could not become part of a kernel.
     @without_checks
     def attempt(change: Any) -> tuple[Steps, BoolScalar]:
-        return solved(given) if one_way else jax.jvp(solved, (given,), (change,))[0]
+        return traced(given) if one_way else jax.jvp(traced, (given,), (change,))[0]
 
     def again(carry: tuple[IntScalar, Steps]) -> tuple[IntScalar, Steps]:
         k, _ = carry

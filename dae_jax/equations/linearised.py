@@ -28,7 +28,7 @@ from .compression import Compression
 from .derivative_orders import Combination, Offsets, find_offsets
 from .index1_form import Index1Form
 from .initial_rates import is_nonlinear, rates_of
-from .manifold_ode import at_one_instant
+from .manifold_ode import at_one_instant, constant
 from .probe import Probe
 from .residual_form import LARGE, ResidualForm
 
@@ -192,7 +192,9 @@ class LinearisedResidual(eqx.Module):
 
     def starting(self, t: Time, y: Float[Array, " n"]) -> "LinearisedResidual":
         """For a solve from (t, y)."""
-        return dataclasses.replace(self, start=jax.lax.stop_gradient(self.rates(t, y)))
+        # Before they are computed, too: JAX would differentiate the search, and throw that away.
+        fixed, t, y = constant((self, t, y))
+        return dataclasses.replace(self, start=constant(fixed.rates(t, y)))
 
     def weights(self, h: Time, raised: Time = 1.0) -> Float[Array, " n"]:
         """h^(k−1) for a variable of index k > 1: how much of its error counts; up to `raised` times that, or h^(k−2), for those

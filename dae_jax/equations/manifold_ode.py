@@ -11,6 +11,7 @@ from typing import Any, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 import equinox as eqx
 import jax
+from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ..compiler import scalarise, subroutine
@@ -22,6 +23,11 @@ _T = TypeVar("_T")
 Normals: TypeAlias = Array | tuple[Array, ...]
 # What is added to the highest derivative of a constraint, of the constraint and its lower derivatives.
 Feedback: TypeAlias = Callable[..., Array]
+
+
+def constant(tree: Any) -> Any:
+    """A pytree whose arrays have no derivative."""
+    return jax.tree.map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
 
 
 @runtime_checkable

@@ -32,7 +32,7 @@ from ..types import Args, DType, Flat, IntScalar, Scalar, State, Time
 from .constraint_jacobian import Rank
 from .derivative_orders import Combination, derivative_of, find_offsets
 from .initial_rates import is_nonlinear, rates_of
-from .manifold_ode import Feedback, ManifoldODE, at_one_instant
+from .manifold_ode import Feedback, ManifoldODE, at_one_instant, constant
 from .mechanical import MechanicalODE
 from .nearest_point import nearest_point
 from .nearest_step import step_to
@@ -422,7 +422,7 @@ def _nearest(
         return fixed_point(correct, y, max_steps=STARTING)
 
     given = ode, t, known, weights
-    held = jax.tree.map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, given)
+    held = constant(given)
     start, measured = held[2], is_value & (weights > 0)
     # Derivatives have nothing to be near to but what the equations make of them.
     aims = lambda y: jnp.where(is_value, start, y)

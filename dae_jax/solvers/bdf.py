@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from ..equations.manifold_ode import constant
 from ..linalg import implicit_root, rms_norm
 from ..types import BoolLike, Time
 from .felt import felt
@@ -23,7 +24,6 @@ from .residual_steps import (
     Tolerances,
     Work,
     at_min_step,
-    constant,
     corrected,
     goes_on,
     is_smallest,

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from ..equations.manifold_ode import constant
 from ..linalg import implicit_root
 from ..types import BoolLike, Time
 from .felt import felt
@@ -26,7 +27,6 @@ from .residual_steps import (
     Tolerances,
     Work,
     at_min_step,
-    constant,
     corrected,
     goes_on,
     not_begun,

@@ -8,12 +8,13 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from ..equations.manifold_ode import constant
 from ..types import BoolLike, Time
 from .radau import AbstractRadauIIA, RadauIIA5, RadauIIA9, RadauIIA13, RadauState
 from .radau_coefficients import coefficients
 from .radau_step import CollocationPolynomial
 from .replay import Replayable
-from .residual_steps import AbstractResidualSolver, Work, constant
+from .residual_steps import AbstractResidualSolver, Work
 
 
 METHODS: tuple[type[AbstractRadauIIA], ...] = (RadauIIA5, RadauIIA9, RadauIIA13)

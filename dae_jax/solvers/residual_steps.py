@@ -332,11 +332,6 @@ def within(t: Any, t0: Any, t1: Any) -> Any:
     return jnp.where(t < t0, t0, jnp.where(t > t1, t1, t))
 
 
-def constant(tree: Any) -> Any:
-    """A pytree whose arrays have no derivative."""
-    return jax.tree.map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
-
-
 def first_step(rates: Float[Array, " n"], solver: Any, t0: Any, t1: Any, y0: Float[Array, " n"]) -> Any:
     """The size of the first step, from ẏ at the start: no variable moves by more than half its tolerance in it, if time resolves that.
 

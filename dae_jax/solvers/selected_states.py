@@ -8,13 +8,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from ..equations.manifold_ode import constant
 from ..equations.structural_ode import OFF, StructuralODE
 from ..linalg import row_products, solve
 from ..types import BoolLike, Time, Y
 from .chart_steps import AbstractChartSolver
 from .manifold import or_nan, outcome, time_sign
 from .replay import Replayable
-from .residual_steps import AbstractResidualSolver, constant
+from .residual_steps import AbstractResidualSolver
 
 
 # Of the way to a root, what Newton's first correction may miss: half of it and more where another root is as near. At the stages
