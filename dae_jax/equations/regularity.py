@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
 from ..linalg import independent_rows, minor_sign, row_products, semidefinite_solve, smallest_pivot
 from ..types import IntScalar, Phase, Time
@@ -253,7 +253,7 @@ def _is_turned(product: Float[Array, "m m"], scale: Float[Array, " m"], rank: in
     return minor_sign(jax.lax.stop_gradient(product * scale[:, None] * scale), rank) < 0
 
 
-def bearable_drift(tolerance: Time, size: Time) -> Time:
+def bearable_drift(tolerance: Float[ArrayLike, "..."], size: Num[ArrayLike, "..."]) -> Float[Array, "..."]:
     """How far a solution of that size may be off what its method lets drift, and still be trusted."""
     return jnp.minimum(DRIFTED * tolerance, FEW * tolerance + VISIBLE * size)
 
