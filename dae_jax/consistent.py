@@ -15,7 +15,7 @@ from .equations.initial_rates import is_nonlinear, rates_of
 from .equations.linearised import LinearisedResidual
 from .equations.mechanical import MechanicalODE
 from .equations.nearest_point import nearest_point
-from .equations.regularity import mass_is_regular, mass_message
+from .equations.regularity import ALONG, mass_is_regular, mass_message
 from .equations.residual_form import ResidualForm, weighted
 from .equations.structural_ode import StructuralODE
 from .linalg import fixed_point, implicit_root, relative_change
@@ -35,13 +35,12 @@ class Violation(eqx.Module):
     """By how much a state (q, v) violates its constraints.
 
     `residuals`: g and (ġ, h); `distances`: the same divided by the length of each constraint's gradient, that is about
-    how far the state is from satisfying it; `allowed`: the distance that counts as round-off of the user's numbers, for
-    each level.
+    how far the state is from satisfying it; `allowed`: the distance that counts as round-off of the user's numbers.
     """
 
     residuals: tuple[Float[Array, " m"], Float[Array, " mp"]]
     distances: tuple[Float[Array, " m"], Float[Array, " mp"]]
-    allowed: tuple[Float[Array, ""], Float[Array, ""]]
+    allowed: tuple[Float[Array, " m"], Float[Array, " mp"]]
 
     def consistent(self) -> Bool[Array, ""]:
         """Whether every level is within `allowed`; false for NaN."""
@@ -64,19 +63,28 @@ def violation(ode: MechanicalODE, t: Time, y: Phase) -> Violation:
     """How far the flat state y = (q, v) is from the manifold."""
     q, v = y
     eps = jnp.finfo(q.dtype).eps
-    of_q, of_v = (eps**0.5 * (1 + jnp.max(jnp.abs(x))) for x in (q, v))
+    of_q, of_v = (eps**0.5 * size for size in ode.sizes(t, y, (_of_entries(q), _of_entries(v))))
     # A mechanism of micrometres: what is more than a part of itself off is no round-off, whatever the unit.
     of_q = jnp.minimum(of_q, jnp.maximum(eps**0.25 * jnp.max(jnp.abs(q)), 1e4 * eps))
     return Violation(ode.invariants(t, y), ode.distances(t, y), (of_q, of_v))
 
 
+def _of_entries(x: Float[Array, " n"]) -> Float[Array, " n"]:
+    """A part √ε of which is round-off of the user's numbers: for each its own size, as lengths of 1e7 say nothing of the angles beside
+    them. But what is computed along with large ones has their round-off.
+    """
+    return 1 + jnp.abs(x) + ALONG * jnp.finfo(x.dtype).eps ** 0.5 * jnp.max(jnp.abs(x))
+
+
 class Unsolved(eqx.Module):
     """What is left of the equations and the hidden ones for the best derivatives, and how much of it counts as round-off
-    of the user's numbers; whether `several` derivatives satisfy the equations.
+    of the user's numbers; at the end of a solve, where large variables may cross zero, all variables are taken to be as large as the
+    largest: `near_end`. Whether `several` derivatives satisfy the equations.
     """
 
     residuals: Float[Array, " m"]
     allowed: Float[Array, " m"]
+    near_end: Float[Array, " m"]
     equations: tuple[str, ...] = eqx.field(static=True)
     several: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(False))
 
@@ -85,8 +93,8 @@ class Unsolved(eqx.Module):
         return jnp.all(jnp.abs(self.residuals) <= self.allowed)
 
     def as_part(self) -> Float[Array, ""]:
-        """By which part of the state the worst equation is off."""
-        off = jnp.abs(self.residuals) / jnp.where(self.allowed > 0, self.allowed, 1)
+        """By which part of the state at the end of a solve the worst equation is off."""
+        off = jnp.abs(self.residuals) / jnp.where(self.near_end > 0, self.near_end, 1)
         return jnp.finfo(off.dtype).eps ** 0.5 * jnp.max(off, initial=0)
 
     def message(self) -> str:
@@ -113,15 +121,20 @@ def unsolved(system: System, t: Time, state: State, args: Args) -> Unsolved:
     several = rates_of(form, t, y)[1] if is_nonlinear(form, y.dtype) else jnp.asarray(False)
     yd = linearised.rates(t, y)
     j, m = linearised.jacobians(t, y, yd)
-    size = lambda x: 1 + jnp.max(jnp.abs(x))
-    ones = jnp.ones_like(y)
-    terms = linearised.storage.apply(jnp.abs(j), size(y) * ones) + linearised.storage.apply(jnp.abs(m), size(yd) * ones)
-    return Unsolved(linearised.residual(t, y, yd), jnp.finfo(y.dtype).eps ** 0.5 * terms, form.equations, several)
+    apply, root = linearised.storage.apply, jnp.finfo(y.dtype).eps ** 0.5
+    j, m = jnp.abs(j), jnp.abs(m)
+    own, largest = (root * (apply(j, of(y)) + apply(m, of(yd))) for of in (_of_entries, _of_largest))
+    return Unsolved(linearised.residual(t, y, yd), own, largest, form.equations, several)
 
 
 def _left_over(ode: StructuralODE, t: Time, y: Float[Array, " N"]) -> Unsolved:
-    terms = ode.sizes(t, y) * (1 + jnp.max(jnp.abs(y)))
-    return Unsolved(ode.violations(t, y), jnp.finfo(y.dtype).eps ** 0.5 * terms, ode.invariant_names)
+    root = jnp.finfo(y.dtype).eps ** 0.5
+    own, largest = ode.sizes(t, y, (_of_entries(y), _of_largest(y)))
+    return Unsolved(ode.violations(t, y), root * own, root * largest, ode.invariant_names)
+
+
+def _of_largest(x: Float[Array, " n"]) -> Float[Array, " n"]:
+    return jnp.full_like(x, 1 + jnp.max(jnp.abs(x)))
 
 
 @at_ease

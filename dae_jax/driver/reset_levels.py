@@ -58,7 +58,7 @@ def level_at_start(
     """
     value = jnp.asarray(condition(t, y, args))
     # The state as it is: one made anew from the underlying ODE is NaN where the structure allows what the numbers do not.
-    z, decode, zd = flow(system, t, y, args, rank)
+    z, decode, zd = flow(system, t, y, args, rank, together)
     of = lambda t, z: jnp.asarray(condition(t, decode(t, z), args), t.dtype)
     _, rate = jax.jvp(of, (t, z), (jnp.ones_like(t), zd))
     rate = jnp.where(jnp.isfinite(rate), sign * rate, -before)

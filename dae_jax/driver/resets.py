@@ -53,8 +53,8 @@ class Reset(eqx.Module):
     A solve with a `Reset` saves what `SaveAt(t0=..., ts=..., t1=..., fn=...)` asks for: at the time of a reset, the state
     after it. `sol.stats["jumps"]` counts them, `sol.stats["jump_times"]` are their times, padded with infinity. As any
     event, it is found where the condition has different signs at the two ends of a step: two crossings in one step are
-    none. A condition that is 0 at the start is on the side that it moves to; of a time to save at that is that of a reset but for
-    round-off, the state is that before or after it.
+    none. A condition that is 0 at the start, or will be within 3e-11 of the larger of |t0| and |t1|, is on the side that it moves
+    to; of a time to save at that is that of a reset but for round-off, the state is that before or after it.
     """
 
     condition: Callable[..., Any]

@@ -96,6 +96,10 @@ class DenseNormals:
         """The length of each row of A."""
         return jnp.sqrt(jnp.sum(normals[0] ** 2, 1))
 
+    def reach(self, ode: Mechanism, normals: Normals, sizes: Float[Array, " n"]) -> Float[Array, " c"]:
+        """|A| s: what changes of that size may move each by."""
+        return matvec(jnp.abs(normals[0]), sizes)
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SparseNormals:
@@ -160,10 +164,19 @@ class SparseNormals:
     @traced_once
     def lengths(self, ode: Mechanism, normals: Normals) -> Float[Array, " c"]:
         """The length of each row of A."""
+        return jnp.sqrt(jnp.sum(self._entries(ode, normals) ** 2, 0))
+
+    @traced_once
+    def reach(self, ode: Mechanism, normals: Normals, sizes: Float[Array, " n"]) -> Float[Array, " c"]:
+        """|A| s: what changes of that size may move each constraint by."""
+        return jnp.sum(jnp.abs(self._entries(ode, normals)) * sizes[np.maximum(self.columns, 0)], 0)
+
+    def _entries(self, ode: Mechanism, normals: Normals) -> Float[Array, "colours c"]:
+        """C of A itself, whatever the masses."""
         t, q, compressed = normals
         if getattr(ode.mass(q), "ndim", 0) == 3:
-            compressed = self._compressed(ode, t, q, jnp.asarray(self.seeds, q.dtype))
-        return jnp.sqrt(jnp.sum(compressed**2, 0))
+            return self._compressed(ode, t, q, jnp.asarray(self.seeds, q.dtype))
+        return compressed
 
     def _inverse_masses(self, mass: Float[Array, "..."]) -> Float[Array, "colours c"]:
         return 1 / (jnp.broadcast_to(mass, (self.seeds.shape[1],))[np.maximum(self.columns, 0)])

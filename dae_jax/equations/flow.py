@@ -15,13 +15,13 @@ from .structural_ode import underlying_ode
 
 
 def flow(
-    system: System, t: Time, state: State, args: Args, rank: int | Rank | None
+    system: System, t: Time, state: State, args: Args, rank: int | Rank | None, h: Time
 ) -> tuple[Y, Callable[[Time, Y], State], Y]:
     """y, what makes a state of one, and ẏ at a consistent state.
 
-    ẏ is that of the underlying ODE. Of a large system that would be dense, and ẏ is (y₁ − y)/h after one short step of the
-    implicit Euler method, (J + M/h)(y₁ − y) = M ẏ₀ − F(t + h, y, ẏ₀), which gives algebraic variables of index 1 theirs
-    also; NaN where it has hidden equations.
+    ẏ is that of the underlying ODE. Of a large system that would be dense, and ẏ is (y₁ − y)/h after one step of the implicit
+    Euler method, (J + M/h)(y₁ − y) = M ẏ₀ − F(t + h, y, ẏ₀), which gives algebraic variables of index 1 theirs also; NaN where it
+    has hidden equations. `h` is short beside all that moves: no number of seconds is.
     """
     if is_mechanism(system) or sum(jnp.size(x) for x in jax.tree.leaves(state)) <= LARGE:
         y, ode = underlying_ode(system, t, state, args, rank)
@@ -31,7 +31,7 @@ def flow(
     linearised = LinearisedResidual.of(form, y)
     if linearised.structure.hidden:
         return y, form.decode, jnp.full_like(y, jnp.nan)
-    h = jnp.finfo(y.dtype).eps ** 0.5 * jnp.maximum(jnp.abs(t), 1)
+    h = jnp.asarray(h, y.dtype)
     yd = linearised.rates(t, y)
     j, m = linearised.jacobians(t, y, yd)
     off = linearised.storage.apply(m, yd) - linearised.residual(t + h, y, yd)

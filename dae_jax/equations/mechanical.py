@@ -213,6 +213,17 @@ class MechanicalODE(ManifoldODE):
         return jnp.abs(g) / lengths[: self.holonomic], jnp.abs(velocity) / lengths
 
     @at_one_instant
+    def sizes(self, t: Time, y: Phase, of: Phase) -> tuple[Float[Array, " m"], Float[Array, " mp"]]:
+        """What counts as the size of the state for each constraint, in units of `distances`: Σ |Aᵢⱼ| sⱼ / |Aᵢ| for coordinates and
+        speeds of the sizes `of`. A large one says nothing of a constraint in which it does not occur.
+        """
+        normals = self.normals(t, y)
+        lengths = self.linear.lengths(self, normals)
+        lengths = jnp.where(lengths > 0, lengths, 1)
+        positions, velocities = (self.linear.reach(self, normals, s) / lengths for s in of)
+        return positions[: self.holonomic], velocities
+
+    @at_one_instant
     def invariants(self, t: Time, y: Phase) -> tuple[Float[Array, " m"], Float[Array, " mp"]]:
         q, v = y
         return self.constraint(t, q), self.velocity_constraint(t, q, v)

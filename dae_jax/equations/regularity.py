@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
 from ..linalg import independent_rows, minor_sign, row_products, semidefinite_solve, smallest_pivot
 from ..types import IntScalar, Phase, Time
@@ -24,6 +24,8 @@ DRIFTED, FEW, VISIBLE = 1000, 10, 0.05
 FAR = 6
 # Tolerances that stand in for those of fixed steps.
 COARSE = 1e-3
+# In digits of the largest of all numbers, what may be round-off of each that is computed along with it.
+ALONG = 100
 
 
 def mass_is_regular(ode: MechanicalODE, q: Float[Array, " n"], invertible: bool) -> Bool[Array, ""]:
@@ -251,7 +253,7 @@ def _is_turned(product: Float[Array, "m m"], scale: Float[Array, " m"], rank: in
     return minor_sign(jax.lax.stop_gradient(product * scale[:, None] * scale), rank) < 0
 
 
-def bearable_drift(tolerance: Time, size: Time) -> Time:
+def bearable_drift(tolerance: Float[ArrayLike, "..."], size: Num[ArrayLike, "..."]) -> Float[Array, "..."]:
     """How far a solution of that size may be off what its method lets drift, and still be trusted."""
     return jnp.minimum(DRIFTED * tolerance, FEW * tolerance + VISIBLE * size)
 
@@ -276,16 +278,21 @@ def is_near_constraints(
     size = lambda x: jnp.max(jnp.abs(x), initial=0)
     lengths = jnp.maximum(size(start[0]), size(end[0]))
     # A pendulum at rest has a natural speed too.
-    field = jnp.zeros_like(lengths) if keeps[1] else size(ode.field(t, end)[1])
-    natural = jnp.sqrt(jnp.where(jnp.isfinite(field), field, 0) * lengths)
+    field = jnp.zeros_like(end[1]) if keeps[1] else jnp.abs(ode.field(t, end)[1])
+    field = jnp.where(jnp.isfinite(field), field, 0)
+    natural = jnp.sqrt(size(field) * lengths)
     speeds = jnp.maximum(jnp.maximum(size(start[1]), size(end[1])), natural)
     near, drifted = jnp.asarray(True), jnp.asarray(False)
-    for distance, kept, here in zip(ode.distances(t, end), keeps, (lengths, speeds), strict=True):
+    own = tuple(jnp.maximum(jnp.abs(a), jnp.abs(b)) for a, b in zip(start, end, strict=True))
+    own = own[0], jnp.maximum(own[1], jnp.sqrt(field * own[0]))
+    levels = ode.distances(t, end), keeps, (lengths, speeds), ode.sizes(t, end, own)
+    for distance, kept, here, each in zip(*levels, strict=True):
         by_tolerance = LEFT * (atol + rtol * here) if residual or not kept else 0
         allowed = root * (1 + here) + by_tolerance + (0 if kept else LARGE * here)
         near = near & jnp.all(distance <= allowed)
         if not kept:
-            drifted = drifted | jnp.any(distance > root * (1 + here) + bearable_drift(atol + rtol * here, here))
+            floor = root * (1 + each + ALONG * root * here)
+            drifted = drifted | jnp.any(distance > floor + bearable_drift(atol + rtol * each, each))
     return near & _redundant_agree(ode, t, end, root), drifted & (rtol + atol > 0)
 
 

@@ -262,11 +262,13 @@ class StructuralODE(ManifoldODE):
         """∂H/∂Y, whose rows are normal to the manifold in the metric in which all entries of Y count alike."""
         return jax.jacfwd(self.violations, 1)(t, y)
 
-    def sizes(self, t: Time, y: Float[Array, " N"]) -> Float[Array, " m"]:
-        """Σ |∂H/∂Y| of each invariant."""
+    def sizes(self, t: Time, y: Float[Array, " N"], of: tuple[Float[Array, " N"], ...]) -> list[Float[Array, " m"]]:
+        """Σ |∂H/∂Y| s of each invariant, for each s in `of`."""
         if self.sparse is not None:
-            return self.sparse.row_sums(jnp.abs(self.sparse.entries(self, t, y)))
-        return jnp.sum(jnp.abs(self.normals(t, y)), 1)
+            entries = jnp.abs(self.sparse.entries(self, t, y))
+            return [self.sparse.row_sums(entries * s[self.sparse.columns]) for s in of]
+        entries = jnp.abs(self.normals(t, y))
+        return [jnp.sum(entries * s, 1) for s in of]
 
     def tangent(self, dy: Float[Array, " N"], normals: Float[Array, "m N"]) -> Any:
         if not len(normals):

@@ -33,7 +33,8 @@ class Baumgarte(AbstractFieldFormulation):
 
     - `alpha`, `beta`: α and β, in 1/s; arrays may be batched over and differentiated.
 
-    Errors: `ValueError` for a negative α, with which errors grow.
+    Errors: `ValueError` for a negative α, with which errors grow; where α is traced, as in a batch, such a solve fails at its start
+    (`RESULTS.step_rejected`, or `RESULTS.not_finite` with fixed steps).
 
     Source: J. Baumgarte, Comput. Methods Appl. Mech. Eng. 1 (1972), 1–16.
     """
@@ -53,7 +54,9 @@ class Baumgarte(AbstractFieldFormulation):
                 "part then, and an error of the constraint grows without bound."
             )
         # Arrays, so that another value is not another compilation.
-        self.alpha = jnp.asarray(alpha, jnp.result_type(float, alpha))
+        alpha = jnp.asarray(alpha, jnp.result_type(float, alpha))
+        # What is traced can be refused by its solve alone.
+        self.alpha = jnp.where(alpha < 0, jnp.nan, alpha) if isinstance(alpha, Tracer) else alpha
         self.beta = jnp.asarray(beta, jnp.result_type(float, beta))
 
     def refuse(self, system: System) -> None:

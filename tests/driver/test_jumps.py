@@ -10,6 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.special import ellipk
 
 import dae_jax
+from dae_jax.equations.residual_form import LARGE
 from dae_jax.scenes import pendulum
 
 
@@ -452,3 +453,16 @@ def test_resets_know_no_unit_of_length(solver, length):
     assert sol.stats["jumps"] == 3
     np.testing.assert_allclose(sol.stats["jump_times"][:3], [1.0, 3.0, 5.0], rtol=3e-4)
     np.testing.assert_allclose(sol.final[0], length, rtol=1e-6)
+
+
+def test_resets_of_a_large_system_know_no_unit_of_time():
+    """sin ωt falls through zero three times in ten turns of a nanosecond: its rate after a reset is not that of √ε s."""
+    omega, many = 0.7e9, LARGE
+    residual = lambda t, y, yd, args: jnp.append(yd[:-1] / omega + y[:-1], y[-1] - jnp.sin(omega * t))
+    event = dae_jax.Reset(lambda t, y, n, **_: y[-1], lambda t, y, n: (y, n + 1.0), direction=False)
+    start = jnp.append(jnp.ones(many), 0.0)
+    sol = dae_jax.daesolve(
+        dae_jax.ImplicitDAE(residual), dae_jax.RadauIIA5(), 0.0, 20 / omega, None, start, 0.0, event=event
+    )
+    assert sol.stats["jumps"] == 3
+    np.testing.assert_allclose(omega * sol.stats["jump_times"][:3], np.pi * np.array([1, 3, 5]), rtol=1e-6)

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import dae_jax
 
@@ -73,3 +74,16 @@ def test_the_nearest_state_with_given_rates_near_by():
     system = dae_jax.ImplicitDAE(squared)
     y0 = dae_jax.consistent_state(system, 0.0, jnp.zeros(2), yd0=jnp.array([1.0, 1.4]))
     np.testing.assert_allclose(y0, 0, atol=1e-9)
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e-3, 1.0, 1e6])
+def test_the_search_knows_no_unit_of_time(unit):
+    """T ẏ = 3 or −1; and ln y − 1 alone, beside which exp T ẏ overflows or vanishes."""
+    solve = lambda residual: dae_jax.daesolve(
+        dae_jax.ImplicitDAE(residual), dae_jax.RadauIIA5(), 0.0, 0.5 * unit, None, jnp.ones(1)
+    )
+    with pytest.raises(ValueError, match="several ẏ satisfy them at the start"):
+        solve(lambda t, y, yd, args: (unit * yd - 3) * (unit * yd + 1))
+    sol = solve(lambda t, y, yd, args: jnp.exp(unit * yd) - y / jnp.e)
+    known = solve_ivp(lambda t, y: np.log(y) - 1, (0, 0.5), [1.0], method="DOP853", rtol=1e-12, atol=1e-12).y[0, -1]
+    np.testing.assert_allclose(sol.ys[-1], known, rtol=1e-7)

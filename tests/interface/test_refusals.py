@@ -289,6 +289,13 @@ def test_wrong_input_is_refused_in_a_sentence(call, said):
         call()
 
 
+@pytest.mark.parametrize("dt0", [None, 0.01])
+def test_a_batch_refuses_its_lane_with_a_negative_alpha(dt0):
+    """Errors grow there like those of which a number is refused."""
+    run = lambda alpha: solve(solver=TSIT5, dt0=dt0, formulation=D.Baumgarte(alpha, 2.0), throw=False).result._value
+    assert (jax.vmap(run)(jnp.array([-3.0, 0.0, 3.0])) != 0).tolist() == [True, False, False]
+
+
 def test_also_under_jit():
     """What needs no numbers is refused while the program is traced."""
     bad = D.ConstrainedSystem(lambda t, q, v, a: jnp.zeros(3), constraint)

@@ -1,0 +1,81 @@
+"""Starts and drift where some unknowns are large: what is a part of these is all of the others."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import pytest
+
+import dae_jax
+from dae_jax import AccuracyWarning, ConstrainedSystem, ImplicitDAE, OrthogonalProjection
+
+
+ORBIT, TURN = 6.8e6, 1.2e-3
+
+
+def unit_vector(force=lambda t, q, v, args: jnp.zeros(3), orbit=ORBIT):
+    """A coordinate far away, and a unit vector beside it."""
+    start = jnp.array([orbit, 1.0, 0.0]), jnp.array([7.6e3, 0.0, TURN])
+    return ConstrainedSystem(force, lambda t, q, args: (q[1:] @ q[1:] - 1) / 2), start
+
+
+def circuit(t, y, yd, args):
+    """A conductance, and a count of 1e7 beside it, which occurs in another equation."""
+    u, i, count = y
+    return jnp.stack([yd[0] + u, i - u, yd[2] + count])
+
+
+def sliding(t, y, yd, args):
+    """Index 2: x − w = 0, and its derivative v − ẇ = 0 with ẇ = w, beside a count of 1e7."""
+    x, v, w, count, force = y
+    return jnp.stack([yd[0] - v, yd[1] - force, yd[2] - w, yd[3] + count, x - w])
+
+
+@pytest.mark.parametrize("level", [0, 1])
+def test_a_part_of_the_orbit_is_no_round_off_of_a_unit_vector(level):
+    system, start = unit_vector()
+    off = jnp.array([0.0, 0.05, 0.0]) if level == 0 else jnp.array([0.0, 1e-4, 0.0])
+    start = tuple(x + off if k == level else x for k, x in enumerate(start))
+    solve = lambda start, **options: dae_jax.daesolve(
+        system, OrthogonalProjection(dae_jax.DOP853()), 0.0, 100.0, None, start, **options
+    )
+    with pytest.raises(ValueError, match=["position level", "velocity level"][level]):
+        solve(start)
+    solve(dae_jax.consistent_state(system, 0.0, start))
+    code = jax.jit(lambda start: solve(start, throw=False).result._value)(start)
+    assert int(code) == int(dae_jax.RESULTS.inconsistent_start._value)
+
+
+@pytest.mark.parametrize(
+    ("residual", "start", "wrong"),
+    [(circuit, [1.0, 1.0, 1e7], 1), (sliding, [1.0, 1.0, 1.0, 1e7, 1.0], 0), (sliding, [1.0, 1.0, 1.0, 1e7, 1.0], 1)],
+    ids=["index 1", "index 3", "hidden"],
+)
+def test_a_part_of_a_count_is_no_round_off_of_a_current(residual, start, wrong):
+    system, y0 = ImplicitDAE(residual), jnp.array(start)
+    solve = lambda y0: dae_jax.daesolve(system, dae_jax.RadauIIA5(), 0.0, 0.1, None, y0)
+    solve(solve(y0).final)
+    with pytest.raises(ValueError, match="violates the equations"):
+        solve(y0.at[wrong].add(1e-3))
+
+
+@pytest.mark.parametrize("orbit", [1.0, ORBIT])
+def test_drift_beside_a_large_coordinate(orbit):
+    system, (q, v) = unit_vector(orbit=orbit)
+    v = v * jnp.array([1.0, 0.0, 1 / TURN])
+    with pytest.warns(AccuracyWarning, match="drift"):
+        sol = dae_jax.daesolve(system, diffrax.Euler(), 0.0, 2.0, 0.1, (q, v))
+    assert float(dae_jax.drift(system, sol).position[-1]) > 0.1
+
+
+@pytest.mark.parametrize("amplitude", [0.0, 1e7])
+@pytest.mark.parametrize(
+    "solver", [OrthogonalProjection(dae_jax.DOP853()), dae_jax.RadauIIA5()], ids=["explicit", "GGL"]
+)
+def test_what_a_solve_ends_with_is_a_start_at_zeros_too(solver, amplitude):
+    """At the turning points of a pendulum, beside an oscillator that is at its largest there, or at zero."""
+    system, _ = unit_vector(lambda t, q, v, args: jnp.array([-q[0], 0.0, -1.0]))
+    start = jnp.array([amplitude, 1.0, 0.0]), jnp.zeros(3)
+    ends = jnp.linspace(0.05, 9.0, 200)
+    sol = dae_jax.daesolve(system, solver, 0.0, 9.0, None, start, saveat=diffrax.SaveAt(ts=ends))
+    again = lambda t, y: dae_jax.daesolve(system, solver, t, t + 1e-3, None, y, throw=False).result._value
+    assert not jnp.any(jax.vmap(again)(ends, sol.ys))
