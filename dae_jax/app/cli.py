@@ -239,7 +239,7 @@ def _add_tune(commands: argparse._SubParsersAction) -> None:
 
 
 def _tune(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> int:
-    from .maps import write_tuned
+    from .maps import FAILED, write_tuned
 
     names = ("t1", "dt0", "steps", "starts")
     options.refuse_not_positive(parser, **{f"--{name}": getattr(arguments, name) for name in names})
@@ -261,6 +261,13 @@ def _tune(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> int
         for solve, found in zip(solves, point.verification, strict=True):
             print(f"  verified with {solve:41s}{found.error:10.1e}{found.drift:10.1e}")
     print(*paths, sep="\n")
+    if after.loss >= FAILED:
+        print(
+            "No α and β were found with which all solves reach their end: there is nothing to choose among. Steps of "
+            f"{arguments.dt0:g} s may be too long for this mechanism; try a smaller --dt0, or a shorter --t1.",
+            file=sys.stderr,
+        )
+        return 1
     return 0
 
 

@@ -147,6 +147,11 @@ def test_tune_prints_what_it_found_and_verifies_it(tmp_path, capsys):
         assert data["best"][0, -1] < data["loss"][0, 0] - 3
 
 
+def test_tune_says_where_no_solve_reaches_its_end(tmp_path, capsys):
+    assert main(["tune", "pendulum", "--dt0", "0.5", "--t1", "20", "--steps", "1", "--out", str(tmp_path)]) == 1
+    assert "No α and β were found with which all solves reach their end" in capsys.readouterr().err
+
+
 def test_analyse_prints_and_draws_a_system_of_a_module(tmp_path, monkeypatch, capsys):
     (tmp_path / "mine.py").write_text(
         "import dae_jax, numpy as np\nintegrator = dae_jax.ImplicitDAE(lambda t, y, yd, a: yd - y), np.ones(1)\n"
