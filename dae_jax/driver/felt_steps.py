@@ -5,87 +5,33 @@ parameter grows into is lost in such steps. A derivative is found by steps whose
 derivative's own, relative to its size.
 """
 
-import dataclasses
-import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.extend.core import jaxpr_as_fun
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, PyTree
 
 from ..compiler import equations
 from ..compiler.jaxprs.unchecked import without_checks
-from ..equations.consistent_change import consistent_change
 from ..solvers import felt
-from ..systems import is_mechanism
 from ..types import BoolScalar, IntScalar, Scalar, Time, Y
 from .followed_steps import Steps, as_bits, of_bits, reach
 from .observed_steps import AbstractStepsOf
-from .problem import Problem
 
 
 if TYPE_CHECKING:
-    from .program import Solve
+    pass
 
 
 # In parts of the solve, steps in which round-off of a derivative, over the step, is no reason for smaller ones.
 SMALL = 1e-6
-# Parameters change by this part of them. What they lead to counts where changes of the start have died down, and does not hide these
-# elsewhere: errors are relative to the largest of all that changes, a multiplier too.
-PARAMETERS = 0.01
 
 
 class OneDirection(diffrax.ForwardMode):
     """Forward derivatives along one direction, by steps that are short enough for it: those of the solution are the same."""
-
-
-def changing(solve: "Solve", problem: Problem) -> tuple[Any, Any]:
-    """What a derivative may be by, the inexact arrays in (formulation, system, args) and the start, and all else of these."""
-    return eqx.partition(((solve.formulation, problem.system, problem.args), problem.y0), eqx.is_inexact_array)
-
-
-def with_changes(solve: "Solve", problem: Problem, given: Any) -> tuple["Solve", Problem]:
-    """The same with others of what is `changing`."""
-    (formulation, system, args), y0 = given
-    return (
-        dataclasses.replace(solve, formulation=formulation),
-        dataclasses.replace(problem, system=system, args=args, y0=y0),
-    )
-
-
-def some_changes(solve: "Solve", problem: Problem, consistent: bool) -> Any:
-    """A change of all that is `changing`, by no pattern, and, where the start must stay `consistent` and parameters may change the index,
-    one of the start alone. Nothing changes where no such is found: then steps are those of the solution.
-    """
-    (parameters, start), _ = changing(solve, problem)
-    of_parameters = _by_no_pattern(parameters, lambda x: PARAMETERS * jnp.where(x == 0, 1, jnp.abs(x)))
-    change = _by_no_pattern(start, lambda x: 1 + jnp.abs(x))
-    if not consistent:
-        return jax.tree.map(lambda x: x[None], (of_parameters, change))
-    system, t0, y0, args = problem.start
-    # In any metric, where a mass may be 0.
-    without_mass = lambda x: eqx.tree_at(lambda x: x.mass, x, None, is_leaf=lambda x: x is None)
-    metric = without_mass if is_mechanism(system) else lambda x: x
-
-    @functools.partial(jax.vmap, axis_size=2)
-    def changes(of_parameters: Any) -> Any:
-        along = consistent_change(metric(system), t0, y0, change, args, (metric(of_parameters[1]), of_parameters[2]))
-        found = jnp.all(jnp.isfinite(ravel_pytree(along)[0]))
-        return jax.tree.map(lambda x: jnp.where(found, x, 0), (of_parameters, along))
-
-    return changes(jax.tree.map(lambda x: jnp.stack([x, jnp.zeros_like(x)]), of_parameters))
-
-
-def _by_no_pattern(tree: PyTree[Array], sizes: Callable[[Array], Array]) -> Any:
-    numbers, unflatten = ravel_pytree(tree)
-    # Parameters may be complex.
-    return unflatten((sizes(numbers) * jnp.cos(1.0 + jnp.arange(numbers.size) ** 2)).astype(numbers.dtype))
 
 
 def by_felt_steps(solved: Callable[[Any], tuple[Steps, BoolScalar]], given: Any, changes: Any) -> Steps:

@@ -24,11 +24,12 @@ from ..solvers import AbstractManifoldSolver, economical, replays, takes_residua
 from ..types import BoolScalar, Scalar, State
 from ..validate.captured import settled
 from ..validate.user_functions import refuse_wrong_functions, returned
+from .changes import changing, some_changes, with_changes
 from .diffrax_call import Decode, View, call, failed, steps_of
 from .ends import look
 from .event_functions import known_to_conditions, refuse_wrong_event
 from .failures import refused_on_the_way
-from .felt_steps import OneDirection, by_felt_steps, changing, some_changes, with_changes
+from .felt_steps import OneDirection, by_felt_steps
 from .followed_steps import Steps, as_bits, if_reached, of_bits
 from .outcome import judged
 from .problem import Problem, Program, split
@@ -260,7 +261,8 @@ class Solve:
         def way(args: tuple[Arrays], out: Split) -> Steps:
             (arrays,) = jax.lax.stop_gradient(args)
             solve, problem = program.whole(arrays)
-            changes = some_changes(solve, problem, takes_residuals(self.solver))
+            *_, end, _ = out.whole()
+            changes = some_changes(solve, problem, end, takes_residuals(self.solver))
             found = as_kernel(steps)(arrays, changes, failed(out, problem))
             return refused_on_the_way(found, most) if self.throw else found
 

@@ -225,3 +225,17 @@ def test_too_few_steps_for_a_derivative(solver: str, by: Any) -> None:
         jax.errors.JaxRuntimeError, match=r"SolveFailed: The derivative .* Raise `max_steps`, which is 20."
     ):
         jax.block_until_ready(by(lambda v: of(v, True))(0.0))
+
+
+@pytest.mark.parametrize("unit", [1e6, 1e12, 1e-12])
+@pytest.mark.parametrize("solver", ["Dopri8", "RadauIIA5", "BDF"])
+def test_a_parameter_of_0_hides_no_other(solver: str, unit: float) -> None:
+    """x' = k (p₀ sin ωt + p₁ unit − x) about x = 0, p = 0: what p₁ leads to may be anything, beside what p₀ leads to."""
+    k, w, t = 50.0, 10.0, 2.0
+    system = D.SemiExplicitDAE(
+        lambda t, x, z, p: k * (p[0] * jnp.sin(w * t) + p[1] * unit - x), lambda t, x, z, p: z - x
+    )
+    start = jnp.zeros(1), jnp.zeros(1)
+    end = lambda p: D.daesolve(system, SOLVERS[solver], 0.0, t, None, start, p).ys[0][-1, 0]
+    exact = k * (k * np.sin(w * t) - w * np.cos(w * t) + w * np.exp(-k * t)) / (k**2 + w**2)
+    np.testing.assert_allclose(jax.jacfwd(end)(jnp.zeros(2)), [exact, unit], rtol=1e-7)
