@@ -361,3 +361,12 @@ def test_a_kernel_within_a_kernel_is_a_part_of_it():
         np.testing.assert_allclose(jax.vmap(of(ours))(gs), [of(end)(g) for g in gs], rtol=1e-8)
     total = lambda f: lambda a: jnp.sum(jax.vmap(f)(a * gs))
     np.testing.assert_allclose(jax.grad(total(ours))(1.0), jax.grad(total(end))(1.0), rtol=1e-8)
+
+
+@pytest.mark.parametrize("lanes", [False, True])
+def test_the_derivative_of_what_is_read_beyond_the_end(only_ours, lanes):
+    """JAX reads the last entry there, and its derivative leaves it out."""
+    read = lambda x: jnp.sum((jnp.arange(5.0) * x[0])[(10 * x).astype(int)])
+    batch = jax.vmap if lanes else lambda fn: fn
+    x = jnp.stack([X, 2 * X]) if lanes else X
+    assert_same(batch(jit(jax.grad(read)))(x), batch(jax.grad(read))(x))

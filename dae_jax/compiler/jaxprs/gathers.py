@@ -44,7 +44,15 @@ def scattered(
     mode: jax.lax.GatherScatterMode | str | None,
 ) -> Int[np.ndarray, "..."]:
     """Where `jax.lax.scatter` puts each of the updates, which have this shape; −1: nowhere."""
-    return gathered(places, indices, *windows(places.shape, shape, numbers), mode)
+    return gathered(places, indices, *windows(places.shape, shape, numbers), of_writes(mode))
+
+
+def of_writes(mode: jax.lax.GatherScatterMode | str | None) -> jax.lax.GatherScatterMode:
+    """How a scatter takes indices that are outside: where they were promised not to be, too, XLA leaves out what is written to them,
+    although it reads at the nearest ones.
+    """
+    modes = jax.lax.GatherScatterMode
+    return modes.CLIP if modes.from_any(mode) is modes.CLIP else modes.FILL_OR_DROP
 
 
 def windows(

@@ -209,7 +209,7 @@ def _onto_itself(name: str, dtype: str, draw: Draw) -> Operation:
 def gathering(name: str, dtype: str, draw: Draw) -> Operation:
     x = Operand(dtype, tuple(max(n, 1) for n in draw.shape(1)))
     axis = draw.below(len(x.shape))
-    n, mode = x.shape[axis], draw.one_of(["clip", "fill"])
+    n, mode = x.shape[axis], draw.one_of(["clip", "fill", "promise_in_bounds"])
     at = _index(draw, n, draw.one_of([(), (1,), (3,), (2, 2), (9,), (30,)]))
     match draw.below(5):
         case 0 if len(x.shape) > 1:
@@ -240,7 +240,7 @@ def scattering(name: str, dtype: str, draw: Draw) -> Operation:
         return _onto_itself(name, dtype, draw)
     x = Operand(dtype, tuple(max(n, 1) for n in draw.shape(1)), "plain")
     axis = draw.below(len(x.shape))
-    n, mode = x.shape[axis], draw.one_of(["clip", "drop"])
+    n, mode = x.shape[axis], draw.one_of(["clip", "drop", "promise_in_bounds"])
     at = _index(draw, n, draw.one_of([(), (1,), (3,), (9,)]))
     how = {"scatter": "set", "scatter-sub": "subtract", "scatter-mul": "multiply"}.get(name, name[8:])
     kept = tuple(m for d, m in enumerate(x.shape) if d != axis)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ...jaxprs import movement
-from ...jaxprs.gathers import gathered, windows
+from ...jaxprs.gathers import gathered, of_writes, windows
 from ...jaxprs.objects import are_known, as_indices, objects
 from ...types import Params
 from ..access import load, store
@@ -90,7 +90,7 @@ def _scattered(context: Context, x: Operand, indices: Operand, update: Operand, 
     out, indices, update = _owned(context, x, indices, update)
     numbers, sizes = windows(out.shape, update.shape, p["dimension_numbers"])
     read = indices_of(context, indices, not isinstance(update, np.ndarray) and update.size > memory.few)
-    place = offsets_of(context, out, read, numbers, sizes, p["mode"])
+    place = offsets_of(context, out, read, numbers, sizes, of_writes(p["mode"]))
 
     def put(index: list[Index], x: Number) -> None:
         at, inside = place(index)
