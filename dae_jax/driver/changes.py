@@ -96,15 +96,18 @@ def _units(problem: Problem, parameters: PyTree[Array], fixed: PyTree, end: tupl
         values = _of_functions(system, t, given[1], args)
         return jnp.sum(values * _no_pattern(values.size))
 
+    def slopes(t: Scalar, state: State) -> tuple[Flat, Scalar]:
+        by_parameters, by_state = jax.grad(combined)((parameters, state), t)
+        by_state = jax.tree.map(lambda g, x: g * (1 + jnp.abs(x)), by_state, state)
+        of, of_state = (jnp.abs(ravel_pytree(x)[0]) for x in (by_parameters, by_state))
+        return of, jnp.max(of_state, initial=0.0)
+
     try:
-        slopes = lambda t, state: jax.grad(combined)((parameters, state), t)
-        by_parameters, by_state = jax.vmap(slopes)(*constant((t, state)))
+        found = jax.vmap(slopes)(*constant((t, state)))
     except (TypeError, ValueError, NotImplementedError):
         # A function of the user's that has forward derivatives only.
         return jnp.ones_like(numbers, float)
-    largest = lambda tree: jnp.max(jnp.nan_to_num(jnp.abs(jax.vmap(lambda x: ravel_pytree(x)[0])(tree)), posinf=0.0), 0)
-    each = largest(by_parameters)
-    of_state = jnp.max(largest(jax.tree.map(lambda g, x: g * (1 + jnp.abs(x)), by_state, state)), initial=0.0)
+    each, of_state = (jnp.max(jnp.nan_to_num(x, posinf=0.0), 0) for x in found)
     effect = jnp.maximum(of_state, jnp.max(each * jnp.abs(numbers), initial=0.0))
     eps = jnp.finfo(each.dtype).eps
     known = (each > 0) & (effect > 0)
