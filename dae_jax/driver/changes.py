@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 PARAMETERS = 0.01
 # Where between the start and the end: not where what has a period is 0 again.
 BETWEEN = 0.381966
+# By how many units in the last place of its largest number a state may be off.
+NOISE = 100
 
 
 def changing(solve: "Solve", problem: Problem) -> tuple[Any, Any]:
@@ -80,8 +82,8 @@ def _no_pattern(size: int) -> Flat:
 
 
 def _units(problem: Problem, parameters: PyTree[Array], fixed: PyTree, end: tuple[Time, State]) -> Flat:
-    """How large each parameter is whose own size says nothing, as it is 0: it changes the equations as much as the others and the state
-    do, which it would hide, or they it, in a unit far off; 1 where it does not change them, or nothing is known.
+    """How large each parameter is whose own size says nothing, as it is 0: 1, but where that would change the equations by less than all
+    others and the state do together, which would hide it, or by more than a state of size 1 does, which it would hide: in a unit far off.
 
     Looked at are the user's functions at the start, at the end, and between, in a combination by no pattern.
     """
@@ -96,22 +98,30 @@ def _units(problem: Problem, parameters: PyTree[Array], fixed: PyTree, end: tupl
         values = _of_functions(system, t, given[1], args)
         return jnp.sum(values * _no_pattern(values.size))
 
-    def slopes(t: Scalar, state: State) -> tuple[Flat, Scalar]:
-        by_parameters, by_state = jax.grad(combined)((parameters, state), t)
-        by_state = jax.tree.map(lambda g, x: g * (1 + jnp.abs(x)), by_state, state)
-        of, of_state = (jnp.abs(ravel_pytree(x)[0]) for x in (by_parameters, by_state))
-        return of, jnp.max(of_state, initial=0.0)
+    def effects(t: Scalar, state: State) -> tuple[Flat, Scalar, Scalar]:
+        flat, unflatten = ravel_pytree(state)
+        slopes = lambda x: [jnp.abs(ravel_pytree(g)[0]) for g in jax.grad(combined)((parameters, unflatten(x)), t)]
+        size = jnp.abs(flat)
+        aside = flat + NOISE * jnp.finfo(flat.dtype).eps * jnp.max(size) * _no_pattern(flat.size)
+        (each, by_state), (also, _) = slopes(flat), slopes(aside)
+        # Where round-off of the state makes the difference, there is no effect.
+        each = jnp.where(jnp.abs(each - also) < each / 2, each, 0)
+        return each, jnp.max(by_state * size, initial=0.0), jnp.max(by_state * (1 + size), initial=0.0)
 
     try:
-        found = jax.vmap(slopes)(*constant((t, state)))
+        found = jax.vmap(effects)(*constant((t, state)))
     except (TypeError, ValueError, NotImplementedError):
         # A function of the user's that has forward derivatives only.
         return jnp.ones_like(numbers, float)
-    each, of_state = (jnp.max(jnp.nan_to_num(x, posinf=0.0), 0) for x in found)
-    effect = jnp.maximum(of_state, jnp.max(each * jnp.abs(numbers), initial=0.0))
+    each, least, most = (jnp.max(jnp.nan_to_num(x, posinf=0.0), 0) for x in found)
+    least = jnp.maximum(least, jnp.max(each * jnp.abs(numbers), initial=0.0))
+    most = jnp.maximum(most, least)
+    least = jnp.where(least > 0, least, most)
+    known = (each > 0) & (most > 0)
+    unit = lambda effect: effect / jnp.where(known, each, 1)
+    # No farther off than numbers can tell from round-off.
     eps = jnp.finfo(each.dtype).eps
-    known = (each > 0) & (effect > 0)
-    return jnp.where(known, jnp.clip(effect / jnp.where(known, each, 1), eps, 1 / eps), 1)
+    return jnp.where(known, jnp.clip(jnp.clip(1, unit(least), unit(most)), eps, 1 / eps), 1)
 
 
 def _of_functions(system: System, t: Scalar, state: State, args: Args) -> Flat:
