@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 # Parameters change by this part of them. What they lead to counts where changes of the start have died down, and does not hide these
 # elsewhere: errors are relative to the largest of all that changes, a multiplier too.
-PARAMETERS = 0.01
+PARAMETERS = 0.1
 # Where between the start and the end: not where what has a period is 0 again.
 BETWEEN = 0.381966
 # By how many units in the last place of its largest number a state may be off.

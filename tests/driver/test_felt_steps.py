@@ -227,15 +227,16 @@ def test_too_few_steps_for_a_derivative(solver: str, by: Any) -> None:
         jax.block_until_ready(by(lambda v: of(v, True))(0.0))
 
 
-@pytest.mark.parametrize("unit", [1e6, 1e12, 1e-12])
 @pytest.mark.parametrize("solver", ["Dopri8", "RadauIIA5", "BDF"])
-def test_a_parameter_of_0_hides_no_other(solver: str, unit: float) -> None:
+def test_a_parameter_of_0_hides_no_other(solver: str) -> None:
     """x' = k (p₀ sin ωt + p₁ unit − x) about x = 0, p = 0: what p₁ leads to may be anything, beside what p₀ leads to."""
     k, w, t = 50.0, 10.0, 2.0
     system = D.SemiExplicitDAE(
-        lambda t, x, z, p: k * (p[0] * jnp.sin(w * t) + p[1] * unit - x), lambda t, x, z, p: z - x
+        lambda t, x, z, args: k * (args[0][0] * jnp.sin(w * t) + args[0][1] * args[1] - x), lambda t, x, z, _: z - x
     )
     start = jnp.zeros(1), jnp.zeros(1)
-    end = lambda p: D.daesolve(system, SOLVERS[solver], 0.0, t, None, start, p).ys[0][-1, 0]
+    end = lambda p, unit: D.daesolve(system, SOLVERS[solver], 0.0, t, None, start, (p, unit)).ys[0][-1, 0]
     exact = k * (k * np.sin(w * t) - w * np.cos(w * t) + w * np.exp(-k * t)) / (k**2 + w**2)
-    np.testing.assert_allclose(jax.jacfwd(end)(jnp.zeros(2)), [exact, unit], rtol=1e-7)
+    slopes = jax.jit(jax.jacfwd(end))
+    for unit in (1e6, 1e12, 1e-12):
+        np.testing.assert_allclose(slopes(jnp.zeros(2), unit), [exact, unit], rtol=1e-7)
