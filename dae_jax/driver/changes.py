@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
+from ..compiler import without_checks
 from ..equations.consistent_change import consistent_change
 from ..equations.manifold_ode import constant
 from ..equations.mechanical import MechanicalODE
@@ -98,6 +99,8 @@ def _units(problem: Problem, parameters: PyTree[Array], fixed: PyTree, end: tupl
         values = _of_functions(system, t, given[1], args)
         return jnp.sum(values * _no_pattern(values.size))
 
+    # What a user refuses need not be on the way.
+    @without_checks
     def effects(t: Scalar, state: State) -> tuple[Flat, Scalar, Scalar]:
         flat, unflatten = ravel_pytree(state)
         slopes = lambda x: [jnp.abs(ravel_pytree(g)[0]) for g in jax.grad(combined)((parameters, unflatten(x)), t)]

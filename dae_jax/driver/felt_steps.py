@@ -14,8 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.extend.core import jaxpr_as_fun
 
-from ..compiler import equations
-from ..compiler.jaxprs.unchecked import without_checks
+from ..compiler import equations, without_checks
 from ..solvers import felt
 from ..types import BoolScalar, IntScalar, Scalar, Time, Y
 from .followed_steps import Steps, as_bits, of_bits, reach

@@ -3,6 +3,7 @@
 from typing import Any
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -240,3 +241,20 @@ def test_a_parameter_of_0_hides_no_other(solver: str) -> None:
     slopes = jax.jit(jax.jacfwd(end))
     for unit in (1e6, 1e12, 1e-12):
         np.testing.assert_allclose(slopes(jnp.zeros(2), unit), [exact, unit], rtol=1e-7)
+
+
+def test_a_state_that_is_refused_is_not_asked_for() -> None:
+    """The units of parameters are looked for beside the way, too: within the circle that a pendulum is on."""
+
+    def force(t: Any, q: Any, v: Any, args: Any) -> Any:
+        q = eqx.error_if(q, q @ q < 0.5, "within the circle")
+        return jnp.array([args[1], -args[0]]) * (q @ q)
+
+    system = D.ConstrainedSystem(force, lambda t, q, args: (q @ q - 1) / 2)
+    start = jnp.array([1.0, 0.0]), jnp.zeros(2)
+    end = lambda args: D.daesolve(system, SOLVERS["projection"], 0.0, 1.2, None, start, args).ys[0][-1, 0]
+    slopes, h = jax.grad(end)(jnp.array([9.81, 0.0])), 1e-4
+    differences = [
+        (end(jnp.array([9.81, 0.0]) + d) - end(jnp.array([9.81, 0.0]) - d)) / (2 * h) for d in h * jnp.eye(2)
+    ]
+    np.testing.assert_allclose(slopes, differences, rtol=1e-5)
