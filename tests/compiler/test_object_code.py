@@ -65,11 +65,14 @@ class TestLeastRecentlyUsed:
             raise RuntimeError("LLVM makes no machine code of a module: for a reason of its own")
 
         assert self_test.available()
-        monkeypatch.setattr(programs, "object_code", fails)
-        fn, _ = numbered(400.0)
-        with pytest.raises(jax.errors.JaxRuntimeError, match="could not be loaded"):
-            jax.block_until_ready(jax.jit(one_kernel(fn, "forward"))(X))
+        fn, _ = numbered(407.0)
+        with monkeypatch.context() as patch:
+            patch.setattr(programs, "object_code", fails)
+            with pytest.raises(jax.errors.JaxRuntimeError, match="could not be loaded"):
+                jax.block_until_ready(jax.jit(one_kernel(fn, "forward"))(X))
         assert "for a reason of its own" in caplog.text
+        # The same function is tried anew.
+        np.testing.assert_allclose(jax.jit(one_kernel(fn, "forward"))(X), fn(X), rtol=1e-14)
 
     def test_threads_that_call_what_others_let_go(self, monkeypatch):
         monkeypatch.setattr(programs, "BOUND", 1)

@@ -59,6 +59,10 @@ class _Program:
     def last_use(self) -> int:
         return ctypes.c_int64.from_address(self.slot + 16).value
 
+    def has_failed(self) -> bool:
+        """Whether LLVM has given up, as where memory was short."""
+        return self.making is not None and self.making.done() and self.making.exception() is not None
+
 
 def register(module: str, source: object = None) -> str:
     """Begins to compile a module with a function `{name}.kernel`, and gives the name by which XLA calls it.
@@ -76,11 +80,14 @@ def register(module: str, source: object = None) -> str:
     with _lock:
         if source is not None and current().dump is not None:
             _dump(text, target, name, source)
-        if name not in _programs:
+        program = _programs.get(name)
+        if program is None:
             making = compiled(text, target, optimise)
             program = _Program(name, *_entrance(), making)
             jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(program.handler), platform="cpu")
             _programs[name] = program
+        elif program.has_failed():
+            program.making = compiled(text, target, optimise)
     return name
 
 
