@@ -209,9 +209,9 @@ def _onto_itself(name: str, dtype: str, draw: Draw) -> Operation:
 def gathering(name: str, dtype: str, draw: Draw) -> Operation:
     x = Operand(dtype, tuple(max(n, 1) for n in draw.shape(1)))
     axis = draw.below(len(x.shape))
-    n, mode = x.shape[axis], draw.one_of(["clip", "fill", "promise_in_bounds"])
+    n, mode = x.shape[axis], draw.one_of(["clip", "fill"])
     at = _index(draw, n, draw.one_of([(), (1,), (3,), (2, 2), (9,), (30,)]))
-    match draw.below(5):
+    match draw.below(6):
         case 0 if len(x.shape) > 1:
             other = _index(draw, x.shape[1], at.shape)
             fn, operands = lambda a, i, j: a.at[i, j].get(mode=mode), (x, at, other)
@@ -226,6 +226,9 @@ def gathering(name: str, dtype: str, draw: Draw) -> Operation:
             both = at._replace(shape=(2, *at.shape))
             fn = jax.vmap(lambda a, i: jnp.take(a, i, axis=axis, mode=mode))
             operands = (several, both)
+        case 4:
+            where, mode = (slice(None),) * axis, "promise_in_bounds"
+            fn, operands = lambda a, i: a.at[(*where, i)].get(mode=mode), (x, at)
         case _:
             fn, operands = lambda a, i: jnp.take(a, i, axis=axis, mode=mode), (x, at)
     return Operation(name, fn, operands, smooth=dtype in FLOATS and mode != "fill")
