@@ -6,7 +6,7 @@ derivative's own, relative to its size.
 """
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import diffrax
 import jax
@@ -19,10 +19,6 @@ from ..solvers import felt
 from ..types import BoolScalar, IntScalar, Scalar, Time, Y
 from .followed_steps import Steps, as_bits, of_bits, reach
 from .observed_steps import AbstractStepsOf
-
-
-if TYPE_CHECKING:
-    pass
 
 
 # In parts of the solve, steps in which round-off of a derivative, over the step, is no reason for smaller ones.

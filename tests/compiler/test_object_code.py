@@ -50,7 +50,7 @@ class TestLeastRecentlyUsed:
         name = register(written(jax.make_jaxpr(lambda x: x * 17)(X)))
         program = programs._programs[name]
         assert program.engine is None
-        assert programs._load_again(program.slot)
+        assert programs._fetch(program.slot)
         running = ctypes.c_int64.from_address(program.slot + 8)
         running.value += 1
         assert not programs.runtime().release(program.slot)

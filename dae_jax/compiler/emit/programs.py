@@ -161,7 +161,7 @@ class Runtime:
         self.fill = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(address("fill"))
         self.release = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p)(address("release"))
         self.clock = ctypes.c_int64.from_address(self.engine.get_global_value_address("clock"))
-        self._loader = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p)(_load_again)
+        self._loader = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p)(_fetch)
         for name, value in (
             ("limit.at", ctypes.addressof(THREADS)),
             ("loader", ctypes.cast(self._loader, ctypes.c_void_p).value),
@@ -210,7 +210,7 @@ def _load(program: _Program, code: bytes) -> None:
             total -= old.size + ENGINE
 
 
-def _load_again(slot: int) -> int:
+def _fetch(slot: int) -> int:
     """Called by the handler of a program whose code is not loaded, or no more; 0 where it cannot be."""
     program = next((p for p in list(_programs.values()) if p.slot == slot), None)
     if program is None:
