@@ -9,7 +9,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, PyTree
 
-from .compiler import at_ease
+from .compiler import at_ease, quickly_compiled
 from .equations.constraint_jacobian import dense_mass, of_free, shortest
 from .equations.initial_rates import is_nonlinear, rates_of
 from .equations.linearised import LinearisedResidual
@@ -200,7 +200,7 @@ def _nearest_of_mechanism(system: ConstrainedSystem, t: Time, y0: State, args: A
     return ode.decode(t, y), fine, remains
 
 
-@eqx.filter_jit
+@quickly_compiled
 def _nearest_of_any(system: System, t: Time, y0: State, args: Args, masks: State, rates: State) -> Any:
     form = ResidualForm.of(system, t, y0, args)
     values = form.encode(y0)
@@ -213,7 +213,7 @@ def _nearest_of_any(system: System, t: Time, y0: State, args: Args, masks: State
     return jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), ode.decode(t, y)), fine, remains
 
 
-@eqx.filter_jit
+@quickly_compiled
 def _nearest(ode: MechanicalODE, t: Time, y: Phase, free: Phase) -> Any:
     def iterate(params: PyTree) -> Any:
         ode, _, (q0, v0), (of_q, _) = params

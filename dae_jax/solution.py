@@ -14,7 +14,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree, Real
 
 from ._compat import messages
-from .compiler import at_ease
+from .compiler import at_ease, quickly_compiled
 from .tables import table
 from .types import Args, DType, State, Time
 
@@ -302,7 +302,7 @@ def saved_arrays(sol: DAESolution) -> tuple[Any, State, Args, Args]:
     return jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, parts)
 
 
-@eqx.filter_jit
+@quickly_compiled
 def at_saved_times(
     of: Callable[..., Any],
     what: PyTree,

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from .compiler import at_ease
+from .compiler import at_ease, evaluated_now
 from .compiler.types import Arrays
 from .driver.doubts import warn
 from .driver.event_functions import refuse_other_outputs
@@ -235,7 +235,7 @@ def _run_on_numbers(program: Program, arrays: Arrays, solve: Solve, problem: Pro
 
 def _with_rank(program: Program, solve: Solve, problem: Problem) -> Program:
     """The program for the number of constraints that are independent at the start; it is remembered."""
-    with jax.ensure_compile_time_eval():
+    with evaluated_now():
         better, _ = split((solve, of_known_rank(solve, problem)))
     _of_known_rank[program] = better
     for oldest in list(_of_known_rank)[:-KEPT]:
@@ -259,7 +259,7 @@ def _asks_for_rank(program: Program, solve: Solve, problem: Problem) -> bool:
     if not is_mechanism(problem.system) or hash(program) in _with_few:
         return False
     solve.refuse_wrong_functions(problem)
-    with jax.ensure_compile_time_eval():
+    with evaluated_now():
         crowded = is_crowded(*problem.start)
     if not crowded:
         if len(_with_few) >= REMEMBERED:

@@ -1,7 +1,12 @@
 """How small functions become fast machine code: scalar arithmetic and single kernels."""
 
 from . import waiting as waiting
-from ._compat import at_ease as at_ease, scan_counts as scan_counts
+from ._compat import (
+    at_ease as at_ease,
+    evaluated_now as evaluated_now,
+    scan_counts as scan_counts,
+    trace_state_clean as trace_state_clean,
+)
 from .fallbacks import left_to_xla as left_to_xla
 from .jaxprs.gathers import gathered as gathered, windows as windows
 from .jaxprs.numbers import on_numbers as on_numbers
@@ -22,6 +27,7 @@ from .one_kernel import (
     inexact as inexact,
     one_kernel as one_kernel,
 )
+from .quickly import quickly_compiled as quickly_compiled
 from .settings import (
     configure as configure,
     one_kernel_enabled as one_kernel_enabled,

@@ -3,6 +3,7 @@
 Beside it XLA's interface for foreign functions, which has a version (`emit/interface.py`).
 """
 
+import contextlib
 import functools
 import inspect
 from collections.abc import Callable
@@ -11,6 +12,7 @@ from typing import Any, ParamSpec, TypeVar
 import jax
 import numpy as np
 from jax._src import xla_bridge
+from jax._src.core import trace_state_clean as trace_state_clean
 from jax.interpreters.partial_eval import dce_jaxpr as dce_jaxpr
 
 from .types import Aval, Equation, Params
@@ -54,6 +56,27 @@ def setting(name: str) -> bool:
 def backends_are_initialised() -> bool:
     """Whether JAX has chosen its devices, so that flags of XLA come too late."""
     return xla_bridge.backends_are_initialized()
+
+
+def evaluated_now() -> contextlib.AbstractContextManager[Any]:
+    """What is computed here is computed now, also where a user's function is being traced. Where none is, JAX's own context would only
+    evaluate the constants of what is traced here one by one, each by a program of its own.
+    """
+    return contextlib.nullcontext() if trace_state_clean() else jax.ensure_compile_time_eval()
+
+
+@functools.cache
+def accepted_options(options: tuple[tuple[str, Any], ...]) -> dict[str, Any]:
+    """Those of XLA's options that this version knows."""
+
+    def accepts(name: str, value: Any) -> bool:
+        try:
+            jax.jit(lambda: 0, compiler_options={name: value}).lower().compile()
+        except (RuntimeError, ValueError):
+            return False
+        return True
+
+    return {name: value for name, value in options if accepts(name, value)}
 
 
 def compilation_cache_folder() -> str | None:

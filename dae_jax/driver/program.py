@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from .._compat import is_captured, lacks_reverse_derivatives, trace_state_clean
-from ..compiler import PullBack, inexact, one_kernel, one_kernel_enabled, waiting
+from .._compat import is_captured, lacks_reverse_derivatives
+from ..compiler import PullBack, inexact, one_kernel, one_kernel_enabled, trace_state_clean, waiting
 from ..compiler.kernel_call import as_kernel
 from ..compiler.types import Arrays
 from ..equations.independent import independent

@@ -3,13 +3,13 @@
 from typing import Any
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.typing import ArrayLike
 
+from ..compiler import quickly_compiled
 from ..consistent import unsolved, violation
 from ..equations.constraint_jacobian import Rank, dense_mass
 from ..equations.mechanical import MechanicalODE
@@ -115,7 +115,7 @@ def _advice(system: System, t0: Time, y0: State, args: Args) -> str:
     return f"\n{reason}" if reason else ADVICE
 
 
-@eqx.filter_jit
+@quickly_compiled
 def _look(system: ConstrainedSystem, t: Time, y0: State, args: Args, invertible: bool) -> Any:
     ode = MechanicalODE.of(system, t, y0, args)
     y = ode.encode(y0)
@@ -123,7 +123,7 @@ def _look(system: ConstrainedSystem, t: Time, y0: State, args: Args, invertible:
     return ode, mass, regular, violation(ode, t, y), redundancy(ode, t, y)
 
 
-@eqx.filter_jit
+@quickly_compiled
 def _look_at_residual(system: System, t: Time, y0: State, args: Args) -> Any:
     return unsolved(system, t, y0, args)
 

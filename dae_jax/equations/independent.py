@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..compiler import quickly_compiled
 from ..linalg import independent_rows, row_products
 from ..systems import ConstrainedSystem, System, is_mechanism
 from ..types import Args, Phase, State, Time
@@ -55,7 +56,7 @@ def rows_of(system: System, t: Time, state: State, args: Args, rank: Rank) -> Ro
     return tuple(map(int, _rows_of(system, t, state, args, rank)))
 
 
-@eqx.filter_jit
+@quickly_compiled
 def _rows_of(system: ConstrainedSystem, t: Time, state: State, args: Args, rank: Rank) -> Int[Array, " rank"]:
     ode = MechanicalODE.of(system, t, state, args, rank)
     return _chosen(ode, t, ode.encode(state))

@@ -11,6 +11,7 @@ from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
+from ..compiler import quickly_compiled
 from ..consistent import consistent_state
 from ..systems import ConstrainedSystem
 from ..types import Args, Time
@@ -54,7 +55,7 @@ def assembled(
     return found
 
 
-@eqx.filter_jit
+@quickly_compiled
 def _reversed(mechanism: "Mechanism", q: Coordinates) -> dict[str, Bool[Array, ""]]:
     """Which lower pairs have closed the wrong way round."""
     at = mechanism.configuration(q)

@@ -17,8 +17,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import PyTree
 
-from .._compat import trace_state_clean
-from ..compiler import at_ease, processors
+from ..compiler import at_ease, processors, trace_state_clean
 from ..driver.failures import sentence_of
 from ..solution import RESULTS
 from ..types import State

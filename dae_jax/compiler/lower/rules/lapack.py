@@ -12,6 +12,7 @@ from jaxtyping import Inexact, Int
 
 from ...emit.lapack import symbol
 from ...jaxprs.expansions.factorisations import lu_pivots_to_permutation
+from ...types import Equation
 from ..access import address_of
 from ..arrays import Operand, View
 from ..context import Context
@@ -79,6 +80,31 @@ def triangular_solve(context: Context, a: Operand, b: Operand, **options: Any) -
         by_rows = _transposed(matrix) if by_columns else matrix
         _, x = _on_copies(context, [by_rows, right], lambda a, x: call(a, n, x, columns))
     return [_joined(context, x)]
+
+
+def _of_all(eqn: Equation) -> str | None:
+    n = eqn.outvars[0].aval.shape[-2]
+    return "some of the eigenvalues" if eqn.params["subset_by_index"] not in (None, (0, n)) else None
+
+
+@_factorisation("eigh", requires=_of_all)
+def eigh(context: Context, a: Operand, *, lower: bool, **_: object) -> list[Any]:
+    """Eigenvectors, as columns, and eigenvalues in ascending order of a Hermitian matrix, of one half of it."""
+    decompose = _native(context, "syevd") if context.dtype.kind == "f" else None
+    if decompose is None:
+        return on_host(context, functools.partial(_eigh, lower=lower), [a])
+    n = context.out.shape[0]
+    values = context.outs[1]
+    room, whole = jax.ShapeDtypeStruct((1 + 6 * n + 2 * n * n,), context.dtype), jax.ShapeDtypeStruct((3 + 5 * n,), np.int32)
+    call = functools.partial(_call, context, decompose, "V", "L" if lower else "U", n)
+    vectors, values, _, _, outcome = _on_copies(
+        context,
+        [_transposed(_numbers(context, a, 0)), values, room, whole, _OUTCOME],
+        lambda a, values, room, whole, outcome: call(a, n, values, room, room.size, whole, whole.size, outcome),
+    )
+    checked = jax.make_jaxpr(lambda v, w, failed: tuple(jnp.where(failed == 0, x, jnp.nan) for x in (v, w)))
+    found = checked(context.outs[0], context.outs[1], _OUTCOME)
+    return context.run(found, [_transposed(vectors), values, outcome])
 
 
 # Whether a factorisation was possible.
@@ -201,6 +227,17 @@ def _cholesky(a: Inexact[np.ndarray, "*stack n n"]) -> tuple[np.ndarray]:
         factor, failed = factorise(matrix, lower=True, clean=True)
         found.append(np.full_like(factor, np.nan) if failed else factor)
     return (_stacked(found, a),)
+
+
+def _eigh(a: Inexact[np.ndarray, "*stack n n"], lower: bool) -> tuple[np.ndarray, ...]:
+    from scipy.linalg.lapack import get_lapack_funcs
+
+    (decompose,) = get_lapack_funcs(("heevd" if np.iscomplexobj(a) else "syevd",), (a,))
+    found = []
+    for (matrix,) in _of_each(a):
+        values, vectors, failed = decompose(matrix, lower=lower)
+        found.append([np.full_like(x, np.nan) if failed else x for x in (vectors, values)])
+    return tuple(np.reshape(part, (*a.shape[:-2], *part[0].shape)) for part in zip(*found, strict=True))
 
 
 @dataclasses.dataclass(frozen=True)
