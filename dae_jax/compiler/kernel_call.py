@@ -82,8 +82,10 @@ def _needed(jaxpr: ClosedJaxpr) -> tuple[ClosedJaxpr, list[bool]]:
     return expanded(ClosedJaxpr(needed, jaxpr.consts), checks=False), used
 
 
-def as_kernel(fn: Callable[..., Any]) -> Callable[..., Any]:
-    """`fn` (pytrees of arrays to a pytree of arrays) as one kernel where it can be one; it has no derivative then."""
+def as_kernel(fn: Callable[..., Any], often: bool = True) -> Callable[..., Any]:
+    """`fn` (pytrees of arrays to a pytree of arrays) as one kernel where it can be one; it has no derivative then. `often`: whether more
+    than a look at a result, for which a large kernel is compiled in the least time.
+    """
     known: dict[Any, Any] = {}
 
     def traced(*args: PyTree) -> Any:
@@ -92,7 +94,7 @@ def as_kernel(fn: Callable[..., Any]) -> Callable[..., Any]:
         jaxpr, out = known.get((treedef, shapes)) or _traced(fn, jax.tree.unflatten(treedef, shapes))
         if not any(isinstance(x, Tracer) for x in jaxpr.consts):
             known[treedef, shapes] = jaxpr, out
-        results = called(jaxpr, leaves)
+        results = called(jaxpr, leaves, often)
         return jax.tree.unflatten(out, jax.jit(jaxpr_as_fun(jaxpr))(*leaves) if results is None else results)
 
     return traced
@@ -110,7 +112,7 @@ def without_mesh() -> AbstractContextManager[Any]:
     return jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ()))
 
 
-def called(jaxpr: ClosedJaxpr, args: Sequence[Array]) -> list[Any] | None:
+def called(jaxpr: ClosedJaxpr, args: Sequence[Array], often: bool = True) -> list[Any] | None:
     """The results of a traced function as one kernel; `None` where it cannot be one."""
     outvars = jaxpr.jaxpr.outvars
     known = [v.aval.dtype != jax.dtypes.float0 for v in outvars]
@@ -122,14 +124,14 @@ def called(jaxpr: ClosedJaxpr, args: Sequence[Array]) -> list[Any] | None:
         return None
     if _decided(kernel, ()).compiler == "xla":
         return None
-    numbers = iter(_bind(kernel, (), [x for x, u in zip(args, used, strict=True) if u]))
+    numbers = iter(_bind(kernel, (), [x for x, u in zip(args, used, strict=True) if u], often))
     return [
         next(numbers) if k else np.zeros(v.aval.shape, jax.dtypes.float0) for v, k in zip(outvars, known, strict=True)
     ]
 
 
-def _bind(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Sequence[Array]) -> list[Any]:
-    return kernel_p.bind(*args, jaxpr=jaxpr, lanes=lanes)
+def _bind(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Sequence[Array], often: bool) -> list[Any]:
+    return kernel_p.bind(*args, jaxpr=jaxpr, lanes=lanes, often=often)
 
 
 @kernel_p.def_impl
@@ -141,23 +143,25 @@ def _(*args: Array, **params: Any) -> Any:
 
 
 @kernel_p.def_abstract_eval
-def _(*args: Array, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> Any:
+def _(*args: Array, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], often: bool) -> Any:
     lead = next(((x.shape[0],) for x, b in zip(args, lanes or [False] * len(args), strict=True) if b), ())
     return [v.aval.update(shape=(*lead, *v.aval.shape)) for v in jaxpr.jaxpr.outvars]
 
 
 @at_ease
-def _lower(*args: Array, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], on_gpu: bool) -> list[Any]:
+def _lower(*args: Array, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], often: bool, on_gpu: bool) -> list[Any]:
     began = waiting.begin()
     try:
-        return _lowered(args, jaxpr, lanes, on_gpu)
+        return _lowered(args, jaxpr, lanes, often, on_gpu)
     finally:
         if began:
             waiting.end()
 
 
-def _lowered(args: Sequence[Array], jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], on_gpu: bool) -> list[Any]:
-    ours = _by_llvm(jaxpr, lanes, args, on_gpu)
+def _lowered(
+    args: Sequence[Array], jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], often: bool, on_gpu: bool
+) -> list[Any]:
+    ours = _by_llvm(jaxpr, lanes, args, often, on_gpu)
     if ours is None:
         return kernel_written_out(*args, jaxpr=jaxpr, lanes=lanes) if on_gpu else _by_xla(jaxpr, lanes, args)
     if current().check:
@@ -167,11 +171,13 @@ def _lowered(args: Sequence[Array], jaxpr: ClosedJaxpr, lanes: tuple[bool, ...],
     return ours
 
 
-def _by_llvm(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Sequence[Array], on_gpu: bool) -> list[Any] | None:
+def _by_llvm(
+    jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Sequence[Array], often: bool, on_gpu: bool
+) -> list[Any] | None:
     if _decided(jaxpr, lanes, on_gpu).compiler != "llvm":
         return None
     try:
-        return lower.compiled(jaxpr, lanes, target=gpu() if on_gpu else None)(*args)
+        return lower.compiled(jaxpr, lanes, target=gpu() if on_gpu else None, often=often or bool(lanes))(*args)
     except Unsupported as reason:
         fallbacks.note(str(reason))
     except Exception as error:  # XLA can still do it
@@ -207,7 +213,7 @@ mlir.register_lowering(kernel_p, mlir.lower_fun(kernel_written_out, multiple_res
 
 @at_ease
 def _batch(
-    args: Sequence[Array], dims: Sequence[int | None], *, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]
+    args: Sequence[Array], dims: Sequence[int | None], *, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], often: bool
 ) -> tuple[list[Any], list[Any]]:
     batched = [d is not None for d in dims]
     args = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(args, dims, strict=True)]
@@ -215,15 +221,15 @@ def _batch(
     # `jacfwd` asks that a value which does not depend on the direction stays unbatched.
     differs = lower.varying(jaxpr, batched, in_memory=False)
     if size == 1:  # the one direction of a derivative by a number
-        out = _bind(jaxpr, lanes, [x[0] if b else x for x, b in zip(args, batched, strict=True)])
+        out = _bind(jaxpr, lanes, [x[0] if b else x for x, b in zip(args, batched, strict=True)], often)
         out = [o[None] for o in out]
     elif not lanes:
-        out = _bind(jaxpr, tuple(batched), args)
+        out = _bind(jaxpr, tuple(batched), args, often)
     else:
         inner = next(x.shape[b] for x, b, of in zip(args, batched, lanes, strict=True) if of)
         joined = tuple(map(max, batched, lanes))
         flat = [_joined(x, size, inner, b, of) for x, b, of in zip(args, batched, lanes, strict=True)]
-        out = [o.reshape(size, inner, *o.shape[1:]) for o in _bind(jaxpr, joined, flat)]
+        out = [o.reshape(size, inner, *o.shape[1:]) for o in _bind(jaxpr, joined, flat, often)]
     return [o if d else o[0] for o, d in zip(out, differs, strict=True)], [0 if d else None for d in differs]
 
 

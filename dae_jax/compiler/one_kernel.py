@@ -29,6 +29,7 @@ def one_kernel(
     pull_back: PullBack | None = None,
     forward: Callable[..., Any] | None = None,
     way: Callable[..., PyTree[Array]] | None = None,
+    often: bool = True,
 ) -> Callable[..., Any]:
     """`fn` (pytrees of arrays to a pytree of arrays), compiled to one kernel on the CPU or a GPU where it qualifies.
 
@@ -41,10 +42,11 @@ def one_kernel(
     - `forward`, with "reverse": the same function, with forward derivatives of any order, where `fn` has none.
     - `way(args, result)`, with "reverse": integers that say which way the computation of derivatives goes. These get them as one more
       argument of `fn`, `forward` and `pull_back`, so that they go the same way, whatever their directions are.
+    - `often`: `False` where a result is only looked at: a large kernel is then compiled in the least time.
     """
     if not one_kernel_enabled() or derivative == "any":
         return fn
-    return _forward(fn) if derivative == "forward" else _reverse(fn, pull_back, forward or fn, way)
+    return _forward(fn, often) if derivative == "forward" else _reverse(fn, pull_back, forward or fn, way, often)
 
 
 def _reverse(
@@ -52,10 +54,11 @@ def _reverse(
     pull_back: PullBack | None,
     forward: Callable[..., Any],
     way: Callable[..., PyTree[Array]] | None,
+    often: bool,
 ) -> Callable[..., Any]:
     def flat(*args: PyTree) -> Any:
         leaves, treedef = jax.tree.flatten(args)
-        kernel, args_of = as_kernel(fn), functools.partial(jax.tree.unflatten, treedef)
+        kernel, args_of = as_kernel(fn, often), functools.partial(jax.tree.unflatten, treedef)
 
         @jax.custom_jvp
         def solve(*xs: Array) -> Any:
@@ -152,10 +155,10 @@ def inexact(tree: PyTree) -> list[Any]:
     return list(filter(is_inexact, jax.tree.leaves(tree)))
 
 
-def _forward(fn: Callable[..., Any]) -> Callable[..., Any]:
+def _forward(fn: Callable[..., Any], often: bool = True) -> Callable[..., Any]:
     @jax.custom_jvp
     def solve(*args: PyTree) -> Any:
-        return as_kernel(fn)(*args)
+        return as_kernel(fn, often)(*args)
 
     @solve.defjvp
     def _(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:

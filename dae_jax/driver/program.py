@@ -137,7 +137,7 @@ class Solve:
         *fields, end, _ = one_kernel(numbers, kind, pull_back, forward, way)(arrays).whole()
         check, check_arrays = self._check(problem, end)
         # A yes or no has no derivative.
-        found = one_kernel(check, self.derivative())(jax.lax.stop_gradient(check_arrays))
+        found = one_kernel(check, self.derivative(), often=False)(jax.lax.stop_gradient(check_arrays))
         return judged(self, fields, problem, found, end), found[0][1]
 
     def keeps(self) -> tuple[bool, bool]:

@@ -44,11 +44,12 @@ def compiled(
     batched: Sequence[bool] = (),
     always_copies: bool = False,
     target: Target | None = None,
+    often: bool = True,
 ) -> Callable[..., list[Any]]:
-    """The function as one that JAX calls; arguments and results as `written` has them."""
+    """The function as one that JAX calls; arguments and results as `written` has them, `often` as `register`."""
     text = written(jaxpr, tuple(batched), always_copies, target)
     first = list(batched).index(True) if any(batched) else None
-    name = register(text, jaxpr) if target is None else launch.register(text, target, first)
+    name = register(text, jaxpr, often) if target is None else launch.register(text, target, first)
 
     def call(*xs: Array) -> list[Any]:
         lead = () if first is None else (xs[first].shape[0],)

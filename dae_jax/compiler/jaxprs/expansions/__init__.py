@@ -33,7 +33,7 @@ def _empty(*, dtype: DType, **_: object) -> Any:
     return jnp.zeros((), dtype)
 
 
-def kernel_written_out(*args: Array, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...]) -> list[Any]:
+def kernel_written_out(*args: Array, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], **_: object) -> list[Any]:
     """What a kernel computes, as the equations that it was made from; within another kernel it is a part of that."""
     fn: Callable[..., list[Any]] = jaxpr_as_fun(jaxpr)
     return jax.vmap(fn, in_axes=[0 if b else None for b in lanes])(*args) if lanes else fn(*args)
