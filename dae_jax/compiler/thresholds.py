@@ -65,6 +65,7 @@ class Thresholds:
     vectorised: int = 12
     long_loop: int = 256
     written_out: int = 200
+    numbers_written_out: int = 1000
     turns_written_out: int = 8000
     compaction: int = 2
     matrix_written_out: int = 6

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..linalg import Elimination, SparseDefinite, elimination, independent_rows, semidefinite_solve, take
-from ..linalg.semidefinite import LOOPED
+from ..linalg import Elimination, Factors, SparseDefinite, elimination, factorised, semidefinite_solve, solve_with, take
+from ..linalg.semidefinite import LOOPED, UNROLLED
 from ..structure import column_colouring, dependence, seed_matrix
 from ..types import Flat, Time
 from .manifold_ode import Normals, traced_once
@@ -49,17 +49,18 @@ class DenseNormals:
     rank: Rank | None
 
     def at(self, ode: Mechanism, t: Time, q: Flat, v: Flat) -> tuple[Array, ...]:
-        """A and M⁻¹Aᵀ, the normals in the metric of the mass matrix; and where some constraints depend on others 1 for each of as
-        many as are independent, 0 for the others.
+        """A and M⁻¹Aᵀ, the normals in the metric of the mass matrix; and where solves with A M⁻¹Aᵀ are no straight-line code, or
+        some constraints depend on others, that matrix, with a diagonal of 1, what made it so, and its factors.
         """
         a = ode.constraint_jacobian(t, q, v)
         n = mass_solve(ode.mass(q), a.T)
-        if self.rank is None:
+        if self.rank is None and not UNROLLED < len(a) <= LOOPED:
             return a, n
         gram = _matmul(a, n)
         scale = unit_diagonal(gram)
-        counts = (self.holonomic, self.rank[0]), (len(a), self.rank[1])
-        return a, n, independent_rows(gram * scale[:, None] * scale, counts).astype(q.dtype)
+        gram = gram * scale[:, None] * scale
+        counts = None if self.rank is None else ((self.holonomic, self.rank[0]), (len(a), self.rank[1]))
+        return a, n, gram, scale, *factorised(gram, counts)
 
     def along(self, ode: Mechanism, normals: Normals, x: Float[Array, " n"]) -> Float[Array, " c"]:
         """A x."""
@@ -71,26 +72,27 @@ class DenseNormals:
 
     def gram_solve(self, ode: Mechanism, normals: Normals, b: Float[Array, " c"]) -> Float[Array, " c"]:
         """x with A M⁻¹Aᵀ x = b, of the first constraints where b is shorter; 0 where constraints depend on others."""
-        a, n = normals[0][: b.shape[0]], normals[1][:, : b.shape[0]]
-        gram = _matmul(a, n)
-        if self.rank is None:
-            return semidefinite_solve(gram, b)
-        kept = self.independent(normals)[: b.shape[0]]
-        return kept * semidefinite_solve(of_rows(gram, kept), kept * b)
+        c = b.shape[0]
+        a, n, *rest = normals
+        if not rest:
+            return semidefinite_solve(_matmul(a[:c], n[:, :c]), b)
+        gram, scale, *factors = rest
+        # Pivots of the holonomic constraints come first.
+        count = c if self.rank is None else self.rank[c > self.holonomic]
+        return scale[:c] * solve_with(Factors(*factors).first(count, c), gram[:c, :c], scale[:c] * b)
 
     def least_norm(self, ode: Mechanism, normals: Normals, b: Float[Array, " c"]) -> Float[Array, " c"]:
         """The shortest such x, of b that satisfies all constraints."""
         if self.rank is None:
             return self.gram_solve(ode, normals, b)
-        gram = _matmul(*normals[:2])
         # Which constraints depend on each other has nothing to do with their scale.
-        scale = unit_diagonal(gram)
-        return scale * semidefinite_solve(gram * scale[:, None] * scale, scale * b, self.rank[1])
+        gram, scale = normals[2:4]
+        return scale * semidefinite_solve(gram, scale * b, self.rank[1])
 
     @staticmethod
     def independent(normals: Normals) -> Float[Array, " c"]:
         """1 for each of as many constraints as are independent, where some depend on others."""
-        return normals[2]
+        return Factors(*normals[4:]).kept()
 
     def lengths(self, ode: Mechanism, normals: Normals) -> Float[Array, " c"]:
         """The length of each row of A."""

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..compiler import quickly_compiled
-from ..linalg import independent_rows, row_products
+from ..linalg import factorised, row_products
 from ..systems import ConstrainedSystem, System, is_mechanism
 from ..types import Args, Phase, State, Time
 from .constraint_jacobian import Rank
@@ -46,8 +46,7 @@ def _chosen(ode: MechanicalODE, t: Time, y: Phase) -> Int[Array, " rank"]:
     """As many constraints as are independent at a flat state, and of the holonomic ones as many as of these are."""
     a, _ = jax.lax.stop_gradient(unit_rows(ode, t, y))
     of_g, of_all = (ode.holonomic, len(a)) if ode.rank is None else ode.rank
-    taken = independent_rows(row_products(a, a), ((ode.holonomic, of_g), (len(a), of_all)))
-    return jnp.nonzero(taken, size=of_all)[0]
+    return jnp.sort(factorised(row_products(a, a), ((ode.holonomic, of_g), (len(a), of_all))).order)
 
 
 def rows_of(system: System, t: Time, state: State, args: Args, rank: Rank) -> Rows:

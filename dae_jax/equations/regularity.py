@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
-from ..linalg import independent_rows, minor_sign, row_products, semidefinite_solve, smallest_pivot
+from ..linalg import factorised, minor_sign, row_products, semidefinite_solve, smallest_pivot
 from ..types import IntScalar, Phase, Time
 from .constraint_jacobian import Rank, SparseNormals, mass_solve, matvec, of_rows, unit_diagonal
 from .mechanical import MechanicalODE, allowed_contradiction
@@ -233,7 +233,7 @@ def _drifted_over(ode: MechanicalODE, t: Time, y: Phase, g: Float[Array, "m n"])
     rank = None if ode.rank is None else ode.rank[0]
     off, matrix = ode.constraint(t, y[0]), gram
     if rank is not None:
-        kept = independent_rows(gram * scale[:, None] * scale, ((len(g), rank),)).astype(off.dtype)
+        kept = factorised(gram * scale[:, None] * scale, ((len(g), rank),)).kept()
         off, matrix = kept * off, of_rows(gram, kept)
     multipliers = semidefinite_solve(matrix, off)
     nearest = y[0] - matvec(lifted.T, multipliers)

@@ -1,5 +1,6 @@
 """Linear and nonlinear equations of a few unknowns, solved in plain arithmetic; LAPACK above a measured size."""
 
+from .definite_factors import Factors as Factors, factorised as factorised, solve_with as solve_with
 from .dense import (
     determinant_sign as determinant_sign,
     minor_sign as minor_sign,
@@ -18,10 +19,6 @@ from .newton import (
     roundoff as roundoff,
 )
 from .norm import error_norm as error_norm, rms_norm as rms_norm
-from .semidefinite import (
-    independent_rows as independent_rows,
-    semidefinite_solve as semidefinite_solve,
-    smallest_pivot as smallest_pivot,
-)
+from .semidefinite import semidefinite_solve as semidefinite_solve, smallest_pivot as smallest_pivot
 from .sparse_definite import SparseDefinite as SparseDefinite
 from .tearing import Tearing as Tearing, tearing as tearing

@@ -18,7 +18,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from .semidefinite import definite_pivot, semidefinite_solve
+from .definite_factors import definite_pivot
+from .semidefinite import semidefinite_solve
 
 
 # An unknown with more couplings than this is eliminated last; what is left when all have is solved as a dense system.

@@ -1,22 +1,21 @@
 """Symmetric positive (semi)definite systems S x = b, such as G M⁻¹ Gᵀ λ = b."""
 
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from ..types import IntScalar
+from .definite_factors import definite_pivot, factorised, solve_with
 
 
 # Up to UNROLLED unknowns the elimination is straight-line code; up to LOOPED a loop over columns, which still compiles
 # into one kernel; LAPACK above.
 UNROLLED = 8
 LOOPED = 48
-# A row of length 1 is independent of others beyond doubt where this part of the square of its length is.
-CLEAR = 0.01
 
 
 def semidefinite_solve(
@@ -37,7 +36,7 @@ def semidefinite_solve(
         factor = jax.scipy.linalg.cho_factor(s, lower=True)
         return jax.scipy.linalg.cho_solve(factor, b)
     if m > UNROLLED:
-        return _looped(s, b)
+        return solve_with(factorised(s), s, b)
     return _by_determinant(s, b) if m == 2 else _unrolled(s, b)
 
 
@@ -53,35 +52,6 @@ def smallest_pivot(s: Float[Array, "m m"]) -> Float[Array, ""]:
         return s - s[:, j][:, None] * row, jnp.minimum(smallest, pivot)
 
     return jax.lax.fori_loop(0, s.shape[0], eliminate, (s, jnp.asarray(jnp.inf, s.dtype)))[1]
-
-
-def independent_rows(s: Float[Array, "m m"], counts: Sequence[tuple[int, int]]) -> Bool[Array, " m"]:
-    """Which rows of symmetric, positive semidefinite S, whose diagonal is 1 (or 0), are taken as independent. For each (rows, rank):
-    of the first `rows` rows there are to be `rank`, with those that are taken before.
-
-    The first of those that are independent beyond doubt is taken, so that the choice does not change with round-off; where there is
-    none, the one that is so the most.
-    """
-    m = len(s)
-    place = jnp.arange(m)
-
-    def take(rows: int, _: IntScalar, carry: tuple[Float[Array, "m m"], Bool[Array, " m"]]) -> Any:
-        s, taken = carry
-        left = jnp.where((place < rows) & ~taken, jnp.sum(s * jnp.eye(m, dtype=s.dtype), 1), -1)
-        here = place == jnp.argmax(jnp.where(left > CLEAR, 2.0 + m - place, left))
-        pivot, row = jnp.sum(jnp.where(here, left, 0)), jnp.sum(jnp.where(here[:, None], s, 0), 0)
-        return s - row[:, None] * (row / jnp.where(pivot > 0, pivot, 1)), taken | here
-
-    carry, done = (jax.lax.stop_gradient(s), jnp.zeros(m, bool)), 0
-    for rows, rank in counts:
-        carry = jax.lax.fori_loop(done, rank, functools.partial(take, rows), carry)
-        done = rank
-    return carry[1]
-
-
-def definite_pivot(pivot: Float[Array, "*k"], diagonal: Float[Array, "*k"], m: int) -> Float[Array, "*k"]:
-    """The pivot of an m×m matrix, or NaN where it is round-off of the diagonal entry that it was."""
-    return jnp.where(pivot > 8 * m * float(jnp.finfo(pivot.dtype).eps) * diagonal, pivot, jnp.nan)
 
 
 def _by_determinant(s: Float[Array, "2 2"], b: Float[Array, "2 *k"]) -> Float[Array, "2 *k"]:
@@ -111,26 +81,6 @@ def _unrolled(s: Float[Array, "m m"], b: Float[Array, "m *k"]) -> Float[Array, "
 def _sum(terms: Iterable[Array]):
     terms = list(terms)
     return sum(terms[1:], terms[0]) if terms else 0.0
-
-
-def _looped(s: Float[Array, "m m"], b: Float[Array, "m *k"]) -> Float[Array, "m *k"]:
-    """Gauss–Jordan elimination without pivoting, a column at a time, on [S | b]."""
-    m = s.shape[0]
-    diagonal = jnp.diagonal(s)
-    rhs = b if b.ndim == 2 else b[:, None]
-    rows = jnp.arange(m)
-
-    def eliminate(j: IntScalar, carry):
-        s, rhs = carry
-        pivot = s[j, j]
-        inverse = 1 / definite_pivot(pivot, diagonal[j], m)
-        row, right = s[j] * inverse, rhs[j] * inverse
-        # Row j becomes the scaled pivot row; from every other row its multiple is taken.
-        here, factor = (rows == j)[:, None], s[:, j][:, None]
-        return jnp.where(here, row, s - factor * row), jnp.where(here, right, rhs - factor * right)
-
-    _, rhs = jax.lax.fori_loop(0, m, eliminate, (s, rhs))
-    return rhs if b.ndim == 2 else rhs[:, 0]
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2,))

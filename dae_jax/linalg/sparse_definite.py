@@ -11,7 +11,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ..compiler import compiles
-from .semidefinite import definite_pivot, semidefinite_solve
+from .definite_factors import definite_pivot
+from .semidefinite import semidefinite_solve
 from .sparse_lu import eliminated, solved
 from .symbolic_lu import SymbolicLU, symbolic_lu
 

@@ -121,8 +121,10 @@ class _Estimate:
 def is_written_out(eqn: Equation) -> bool:
     """Whether the turns of a `scan` stand one after another."""
     p, of_ys = eqn.params, [v.aval for v in eqn.outvars[scan_counts(eqn.params)[1] :]]
-    total = p["length"] * (1 + len(equations(p["jaxpr"])))
-    few = total <= THRESHOLDS.written_out and all(y.size <= THRESHOLDS.in_registers for y in of_ys)
+    turn = equations(p["jaxpr"])
+    numbers = p["length"] * sum(v.aval.size for e in turn for v in e.outvars)
+    few = p["length"] * (1 + len(turn)) <= THRESHOLDS.written_out and numbers <= THRESHOLDS.numbers_written_out
+    few = few and all(y.size <= THRESHOLDS.in_registers for y in of_ys)
     return few or p["length"] <= 1
 
 
