@@ -143,7 +143,7 @@ def _(*args: Array, **params: Any) -> Any:
 
 
 @kernel_p.def_abstract_eval
-def _(*args: Array, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], often: bool) -> Any:
+def _(*args: Array, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], **_: bool) -> Any:
     lead = next(((x.shape[0],) for x, b in zip(args, lanes or [False] * len(args), strict=True) if b), ())
     return [v.aval.update(shape=(*lead, *v.aval.shape)) for v in jaxpr.jaxpr.outvars]
 

@@ -1,5 +1,6 @@
 """What stands in a kernel for LAPACK's factorisations, and for sorting, gives what JAX gives."""
 
+import functools
 import itertools
 
 import jax
@@ -129,6 +130,30 @@ def test_large_ones_of_a_batch_and_in_stacks(dtype):
     all_of_them = lambda a, s: (jax.lax.linalg.lu(a), jnp.linalg.cholesky(s), jnp.linalg.solve(s, a))
     assert_expanded(all_of_them, a, s)
     assert_same(jax.vmap(jit(all_of_them))(a, s), jax.vmap(all_of_them)(a, s))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("n", [0, 1, 5, 40])
+def test_eigenvalues_and_eigenvectors_are_those_that_jax_gives(dtype, n):
+    """By the same function, so that signs are the same, and which half is looked at; of stacks and in lanes too."""
+    a = matrix(3, n, n, dtype=dtype)
+    for lower in (True, False):
+        decomposed = functools.partial(jax.lax.linalg.eigh, lower=lower, symmetrize_input=False)
+        assert jit(decomposed).lower(a[0]).compiler == "llvm"
+        assert_expanded(decomposed, a[0])
+        assert_expanded(decomposed, a)
+        assert_same(jax.vmap(jit(decomposed))(a), jax.vmap(decomposed)(a))
+
+
+def test_eigenvalues_of_what_is_not_a_number_are_none():
+    assert_expanded(jnp.linalg.eigh, np.full((4, 4), np.nan))
+
+
+def test_some_eigenvalues_are_left_to_jax():
+    some = lambda a: jax.lax.linalg.eigh(a, subset_by_index=(0, 2))
+    (reason,) = jit(some).lower(np.eye(4)).unsupported
+    assert reason.primitive == "eigh"
+    assert "some of the eigenvalues" in str(reason)
 
 
 def test_large_ones_in_the_lanes_that_ask_for_them():

@@ -14,10 +14,12 @@ from dae_jax.linalg import (
     SmallLU,
     determinant_sign,
     elimination,
+    factorised,
     newton,
     rms_norm,
     semidefinite_solve,
     solve,
+    solve_with,
     tearing,
 )
 from dae_jax.linalg.semidefinite import LOOPED, UNROLLED
@@ -417,3 +419,57 @@ def test_no_pivot_that_may_be_too_small():
     assert len(tearing(np.array([[1.0, 1.0], [1.0, 1.0]])).steps) == 1
     # Beyond 32 unknowns LAPACK is faster.
     assert tearing(np.eye(33)).steps == ()
+
+
+class TestFactors:
+    """Of a matrix some of whose rows depend on others, found once for several right-hand sides."""
+
+    @staticmethod
+    def unit(m, rank):
+        S = semidefinite(m, rank)
+        scale = 1 / np.sqrt(np.diag(S))
+        return S * scale[:, None] * scale
+
+    @pytest.mark.parametrize(("m", "rank"), [(3, 2), (12, 9), (23, 20), (60, 41)])
+    def test_solve_on_as_many_rows_as_are_independent(self, m, rank):
+        S, b = self.unit(m, rank), right(m)
+        factors = factorised(jnp.array(S), ((m, rank),))
+        kept = np.asarray(factors.kept()) == 1
+        assert kept.sum() == rank
+        x = np.asarray(solve_with(factors, jnp.array(S), jnp.array(b)))
+        assert np.all(x[~kept] == 0)
+        np.testing.assert_allclose(S[np.ix_(kept, kept)] @ x[kept], b[kept], atol=1e-9 * abs(b).max())
+
+    def test_rows_are_taken_from_the_first_ones_first(self):
+        # Rows 0 and 1 are the same, and so are 2 and 3 with 4 beside them: of the first three rows two, of all three.
+        vectors = np.array([[1.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 1, 0], [0, 0, 1]])
+        factors = factorised(jnp.array(vectors @ vectors.T), ((3, 2), (5, 3)))
+        np.testing.assert_array_equal(factors.order, [0, 2, 4])
+        np.testing.assert_array_equal(factors.first(2, 3).kept(), [1, 0, 1])
+
+    def test_round_off_does_not_change_which(self):
+        S = self.unit(12, 9)
+        noise = 1e-13 * np.random.default_rng(0).normal(size=S.shape)
+        orders = [factorised(jnp.array(s), ((12, 9),)).order for s in (S, S + noise + noise.T)]
+        np.testing.assert_array_equal(*orders)
+
+    @pytest.mark.parametrize("columns", [(), (3,)])
+    def test_derivatives_are_those_of_the_solution(self, columns):
+        S, b = self.unit(12, 9), right(12, *columns)
+        dS, db = self.unit(12, 5), right(12, *columns)[::-1]
+        solve = lambda s, b: solve_with(factorised(s, ((12, 9),)), s, b)
+        args, dargs = (jnp.array(S), jnp.array(b)), (jnp.array(dS), jnp.array(db))
+        _, slope = jax.jvp(solve, args, dargs)
+        kept = np.asarray(factorised(args[0], ((12, 9),)).kept()) == 1
+        inverse = np.zeros_like(S)
+        inverse[np.ix_(kept, kept)] = np.linalg.inv(S[np.ix_(kept, kept)])
+        expected = inverse @ (db - dS @ (inverse @ b))
+        np.testing.assert_allclose(slope, expected, atol=1e-8 * abs(expected).max())
+        weight = np.ones_like(expected)
+        of_s, of_b = jax.vjp(solve, *args)[1](jnp.array(weight))
+        back = np.sum(of_s * dS) + np.sum(of_b * db)
+        np.testing.assert_allclose(back, np.sum(weight * expected), rtol=1e-7)
+
+    def test_what_is_not_definite_gives_nan(self):
+        S = semidefinite(12, 9)
+        assert np.isnan(solve_with(factorised(jnp.array(S)), jnp.array(S), jnp.array(right(12)))).any()

@@ -171,6 +171,19 @@ def factorised(name: str, dtype: str, draw: Draw) -> Operation:
     return Operation(name, lambda x, b: beside(solve(regular(x), b / (1 + jnp.max(jnp.abs(b))))), (x, b), 64)
 
 
+@recipe("eigh", (*FLOATS, *COMPLEX))
+def decomposed(name: str, dtype: str, draw: Draw) -> Operation:
+    """Eigenvalues that are apart, and the matrix put together again: rounding turns eigenvectors of ones that are close."""
+    n, lower = draw.one_of([1, 2, 5, 9]), draw.chance(0.5)
+
+    def both(x: Any) -> Any:
+        part = 0.1 * x / (1 + jnp.max(jnp.abs(x)))
+        v, w = lax.linalg.eigh(part + jnp.diag(3 + jnp.arange(n, dtype=dtype)), lower=lower, symmetrize_input=False)
+        return w, v @ (w[:, None] * v.conj().T) + 8
+
+    return Operation(name, both, (Operand(dtype, (n, n), "plain"),), 64)
+
+
 def _index(draw: Draw, n: int, shape: Any = ()) -> Operand:
     """Of a type that n is of: JAX counts from the end of an array in the type of the index."""
     dtypes = ["int32", "int64", "uint32", "uint64", "int16", "int8", "uint8"]

@@ -95,7 +95,10 @@ def eigh(context: Context, a: Operand, *, lower: bool, **_: object) -> list[Any]
         return on_host(context, functools.partial(_eigh, lower=lower), [a])
     n = context.out.shape[0]
     values = context.outs[1]
-    room, whole = jax.ShapeDtypeStruct((1 + 6 * n + 2 * n * n,), context.dtype), jax.ShapeDtypeStruct((3 + 5 * n,), np.int32)
+    room, whole = (
+        jax.ShapeDtypeStruct((1 + 6 * n + 2 * n * n,), context.dtype),
+        jax.ShapeDtypeStruct((3 + 5 * n,), np.int32),
+    )
     call = functools.partial(_call, context, decompose, "V", "L" if lower else "U", n)
     vectors, values, _, _, outcome = _on_copies(
         context,
