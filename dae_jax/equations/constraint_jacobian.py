@@ -7,7 +7,7 @@ the other methods; `ode` is the `MechanicalODE` that the constraints belong to.
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -118,14 +118,15 @@ class SparseNormals:
     gram: Elimination | SparseDefinite
 
     @traced_once
-    def at(
-        self, ode: Mechanism, t: Time, q: Flat, v: Flat
-    ) -> tuple[Any, Float[Array, " n"], Float[Array, "colours c"]]:
-        """The point, and C there."""
+    def at(self, ode: Mechanism, t: Time, q: Flat, v: Flat) -> tuple[Array, ...]:
+        """The point, C there, and the factors of A M⁻¹Aᵀ where its elimination is a loop."""
         mass, seeds = ode.mass(q), jnp.asarray(self.seeds, q.dtype)
         if mass is not None and mass.ndim == 3:
             seeds = _unweighted(mass, seeds)
-        return jnp.asarray(t, q.dtype), q, self._compressed(ode, t, q, seeds)
+        compressed = self._compressed(ode, t, q, seeds)
+        looped = isinstance(self.gram, SparseDefinite)
+        factors = self.gram.factors(*self._products(ode, q, compressed)) if looped else ()
+        return jnp.asarray(t, q.dtype), q, compressed, *factors
 
     def _compressed(
         self, ode: Mechanism, t: Time, q: Flat, seeds: Float[Array, "colours n"]
@@ -135,20 +136,29 @@ class SparseNormals:
     @traced_once
     def along(self, ode: Mechanism, normals: Normals, x: Float[Array, " n"]) -> Float[Array, " c"]:
         """A x."""
-        t, q, _ = normals
+        t, q, *_ = normals
         return jax.jvp(functools.partial(ode.constraint, t), (q,), (x,))[1]
 
     @traced_once
     def lift(self, ode: Mechanism, normals: Normals, mu: Float[Array, " c"]) -> Float[Array, " n"]:
         """M⁻¹Aᵀ μ."""
-        t, q, _ = normals
+        t, q, *_ = normals
         _, transpose = jax.vjp(functools.partial(ode.constraint, t), q)
         return mass_solve(ode.mass(q), transpose(mu)[0])
 
     @traced_once
     def gram_solve(self, ode: Mechanism, normals: Normals, b: Float[Array, " c"]) -> Float[Array, " c"]:
         """x with A M⁻¹Aᵀ x = b."""
-        _, q, compressed = normals
+        _, q, compressed, *factors = normals
+        found = self._products(ode, q, compressed)
+        if isinstance(self.gram, SparseDefinite):
+            return self.gram.solve(*found, b, factors)
+        return self.gram.solve(*found, b)
+
+    def _products(
+        self, ode: Mechanism, q: Flat, compressed: Float[Array, "colours c"]
+    ) -> tuple[Float[Array, " c"], Float[Array, " couplings"]]:
+        """The diagonal of A M⁻¹Aᵀ, and its couplings."""
         mass = ode.mass(q)
         rows, columns = self.gram.rows, self.gram.columns
         weighted = compressed if mass is None or mass.ndim == 3 else compressed * self._inverse_masses(mass)
@@ -157,7 +167,7 @@ class SparseNormals:
         )
         at = lambda x, entries: jax.vmap(lambda row: take(row, entries))(x)
         couplings = jnp.sum(shared * at(weighted, rows) * at(compressed, columns), 0)
-        return self.gram.solve(jnp.sum(weighted * compressed, 0), couplings, b)
+        return jnp.sum(weighted * compressed, 0), couplings
 
     def least_norm(self, ode: Mechanism, normals: Normals, b: Float[Array, " c"]) -> Float[Array, " c"]:
         """The only such x: no constraint depends on others."""
@@ -175,7 +185,7 @@ class SparseNormals:
 
     def _entries(self, ode: Mechanism, normals: Normals) -> Float[Array, "colours c"]:
         """C of A itself, whatever the masses."""
-        t, q, compressed = normals
+        t, q, compressed, *_ = normals
         if getattr(ode.mass(q), "ndim", 0) == 3:
             return self._compressed(ode, t, q, jnp.asarray(self.seeds, q.dtype))
         return compressed

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -13,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..compiler import compiles
 from .definite_factors import definite_pivot
 from .semidefinite import semidefinite_solve
-from .sparse_lu import eliminated, solved
+from .sparse_lu import Factors, eliminated, solved
 from .symbolic_lu import SymbolicLU, symbolic_lu
 
 
@@ -53,25 +54,34 @@ class SparseDefinite:
         """Of a solve, in multiplications on whole vectors."""
         return LOOPED_COST * (self.symbolic.cost + 2 * len(self.symbolic.at))
 
-    def solve(
-        self, diagonal: Float[Array, " n"], couplings: Float[Array, " c"], b: Float[Array, " n"]
-    ) -> Float[Array, " n"]:
-        """x with S x = b for positive definite S, given by its diagonal and its entries at (`rows`, `columns`).
-
-        A pivot that is not positive beyond round-off gives NaN.
-        """
-        entries = jnp.concatenate([diagonal, couplings, couplings])
+    def factors(self, diagonal: Float[Array, " n"], couplings: Float[Array, " c"]) -> tuple[Array, ...]:
+        """What is found once for several solves with positive definite S, given by its diagonal and its entries at (`rows`, `columns`)."""
+        entries = lax.stop_gradient(jnp.concatenate([diagonal, couplings, couplings]))
         shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (entries, self.symbolic))
         if not compiles(eliminated, *shapes):
+            return ()
+        order, own = self.symbolic, entries[self.symbolic.rows]
+        found = eliminated(entries, order)
+        pivots = definite_pivot(1 / found.lu[order.diagonal] / found.scale, own, self.size)
+        return *found, jnp.all(pivots > 0)
+
+    def solve(
+        self,
+        diagonal: Float[Array, " n"],
+        couplings: Float[Array, " c"],
+        b: Float[Array, " n"],
+        factors: Sequence[Array] | None = None,
+    ) -> Float[Array, " n"]:
+        """x with S x = b, by the `factors` of S if they are at hand. A pivot that is not positive beyond round-off gives NaN."""
+        entries = jnp.concatenate([diagonal, couplings, couplings])
+        *found, regular = lax.stop_gradient(self.factors(diagonal, couplings) if factors is None else factors) or (
+            None,
+        )
+        if regular is None:
             return semidefinite_solve(jnp.zeros((self.size, self.size), b.dtype).at[self._places].set(entries), b)
-        at_hand, order = lax.stop_gradient((diagonal, entries)), self.symbolic
 
         def inverse(_: Any, b: Float[Array, " n"]) -> Float[Array, " n"]:
-            factors = eliminated(at_hand[1], order)
-            scale, own = factors.scale, at_hand[0][order.rows]
-            pivots = definite_pivot(1 / factors.lu[order.diagonal] / scale, own, self.size)
-            x = solved(factors, b, order)
-            return jnp.where(jnp.all(pivots > 0), x, jnp.nan)
+            return jnp.where(regular, solved(Factors(*found), b, self.symbolic), jnp.nan)
 
         return lax.custom_linear_solve(functools.partial(self._apply, entries), b, inverse, inverse, symmetric=True)
 
