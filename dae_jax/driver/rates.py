@@ -41,7 +41,7 @@ class Rates(eqx.Module):
         return cls(dataclasses.replace(solve, saveat=diffrax.SaveAt(), event=None), problem)
 
     def __call__(self, t: Time, state: State, args: Args) -> Any:
-        formulation = self.solve.formulation
+        formulation: Any = self.solve.formulation
         y, ode = self.solve.encoded(dataclasses.replace(self.problem, t0=t, y0=state, args=args))
         decode = lambda t, y: formulation.decode(t, y, ode)
         return jax.jvp(decode, (t, y), (jnp.ones_like(t), formulation.field(t, y, ode)))[1]
