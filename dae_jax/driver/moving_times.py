@@ -47,8 +47,11 @@ def from_fixed_start(solve: "Solve", problem: Problem) -> Problem:
         (y0, t0, arrays), (dy0, dt0, _) = primals, tangents
         if dt0 is None:
             return y0, dy0
+        # Over an interval without length nothing moves.
         with settled(program.leaves):
-            found = Rates.of(*program.whole(arrays))(t0, y0, program.whole(arrays)[1].args)
+            solve, problem = program.whole(arrays)
+            dt0 = jnp.where(t0 == problem.t1, 0, dt0)
+            found = Rates.of(solve, problem)(t0, y0, problem.args)
         return y0, jax.tree.map(lambda dy, rate: plus(dy, -rate * dt0), dy0, found, is_leaf=_is_none)
 
     y0 = before(problem.y0, problem.t0, arrays)
@@ -161,7 +164,8 @@ class _Part(NamedTuple):
         # Where nothing was saved any state will do.
         known = lambda y, y0: jnp.where(there.reshape(-1, *[1] * y0.ndim), y[rows], y0)
         states, changed = jax.tree.map(known, self.states, problem.y0), jax.tree.map(lambda x: x[rows], changed)
-        found = lax.map(rate, (at, states, changed, along), batch_size=CHUNK)
+        moving = jnp.where(problem.t0 == problem.t1, 0, along)
+        found = lax.map(rate, (at, states, changed, moving), batch_size=CHUNK)
         more = jax.tree.map(lambda y, x: None if x is None else jnp.zeros_like(y).at[rows].add(x), self.ys, found)
         dys = jax.tree.map(plus, self.dys, more, is_leaf=_is_none)
         return plus(self.dts, jnp.zeros_like(self.ts).at[rows].add(along)), dys
