@@ -74,7 +74,10 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "of these times. Or they are not in the order in which the solve passes them, or one is NaN."
     )
     undefined_interval = "`t0` or `t1` is NaN or infinite: there is nothing to solve over."
-    undefined_formulation = "`alpha` of Baumgarte is negative, with which the error of a constraint grows without bound, or `alpha` or `beta` is NaN."
+    undefined_formulation = (
+        "`alpha` of Baumgarte is negative, with which the error of a constraint grows without bound, or `alpha` or `beta` "
+        "is NaN."
+    )
     undefined_condition = (
         "The condition of an event is not a number (NaN) where the solve ended: an event there is not seen. Let it be defined "
         "on either side of its zero."
