@@ -74,6 +74,10 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "of these times. Or they are not in the order in which the solve passes them, or one is NaN."
     )
     undefined_interval = "`t0` or `t1` is NaN or infinite: there is nothing to solve over."
+    undefined_formulation = (
+        "`alpha` of Baumgarte is negative, with which the error of a constraint grows without bound, or `alpha` or `beta` "
+        "is NaN."
+    )
     undefined_condition = (
         "The condition of an event is not a number (NaN) where the solve ended: an event there is not seen. Let it be defined "
         "on either side of its zero."
@@ -149,10 +153,12 @@ class Interpolation(eqx.Module):
     path: diffrax.DenseInterpolation
     # `decode(t, y, ode)`, and its `ode`.
     view: Split
+    # Whether `decode` knows by itself how the state moves with t.
+    still: bool = eqx.field(static=True, default=False)
 
     @classmethod
-    def of(cls, path: diffrax.DenseInterpolation, decode: Callable[..., Any], ode: Any) -> "Interpolation":
-        return cls(path, Split.to_return((decode, ode)))
+    def of(cls, path: diffrax.DenseInterpolation, decode: Callable[..., Any], ode: Any, still: bool) -> "Interpolation":
+        return cls(path, Split.to_return((decode, ode)), still)
 
     @at_ease
     def evaluate(self, t0: Time, t1: Time | None = None, left: bool = True) -> Any:
@@ -160,7 +166,8 @@ class Interpolation(eqx.Module):
         if t1 is not None:
             return jax.tree.map(lambda a, b: b - a, self.evaluate(t0, left=left), self.evaluate(t1, left=left))
         decode, ode = self.view.whole()
-        return decode(t0, self.path.evaluate(t0, left=left), ode)
+        at = jax.lax.stop_gradient(t0) if self.still else t0
+        return decode(t0, self.path.evaluate(at, left=left), ode)
 
 
 class DAESolution(eqx.Module):

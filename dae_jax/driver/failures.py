@@ -35,7 +35,13 @@ from .start import ADVICE
 OKAY = tuple(int(code._value) for code in (RESULTS.successful, RESULTS.event_occurred))
 # Failures that are found at the start, whatever steps were taken.
 _AT_START = tuple(
-    int(code._value) for code in (RESULTS.inconsistent_start, RESULTS.dependent_constraints, RESULTS.no_finite_start)
+    int(code._value)
+    for code in (
+        RESULTS.inconsistent_start,
+        RESULTS.dependent_constraints,
+        RESULTS.no_finite_start,
+        RESULTS.undefined_formulation,
+    )
 )
 
 

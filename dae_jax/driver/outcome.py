@@ -70,6 +70,8 @@ def judged(
         ("inconsistent_start", "dependent_constraints", "irregular_mass", "ambiguous_start"), 1
     ):
         code = RESULTS.where(start == wrong, getattr(RESULTS, name), code)
+    defined = solve.formulation.is_defined()
+    code = code if defined is True else RESULTS.where(jnp.asarray(defined), code, RESULTS.undefined_formulation)
     # diffrax has no step to take where its comparisons with NaN are false.
     defined = jnp.isfinite(problem.t0) & jnp.isfinite(problem.t1)
     code = RESULTS.where(defined, code, RESULTS.undefined_interval)

@@ -31,6 +31,7 @@ from .event_functions import known_to_conditions, refuse_wrong_event
 from .failures import refused_on_the_way
 from .felt_steps import OneDirection, by_felt_steps
 from .followed_steps import Steps, as_bits, if_reached, of_bits
+from .moving_times import from_fixed_start, with_moving_times
 from .outcome import judged
 from .problem import Problem, Program, split
 from .resets import Reset, solve_with_resets
@@ -66,8 +67,12 @@ def _jitted(program: Program, arrays: Arrays) -> Any:
     waiting.begin(always=not isinstance(solve.progress_meter, diffrax.NoProgressMeter))
     solve.refuse_wrong_functions(problem)
     with settled(program.leaves):
-        sol, as_expected = solve_with_resets(solve, problem) if isinstance(solve.event, Reset) else solve(problem)
+        sol, as_expected = with_moving_times(_solved, solve, problem)
     return Split.of(sol), as_expected
+
+
+def _solved(solve: "Solve", problem: Problem) -> tuple[DAESolution, Any]:
+    return solve_with_resets(solve, problem) if isinstance(solve.event, Reset) else solve(problem)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -129,6 +134,7 @@ class Solve:
     def __call__(self, problem: Problem) -> tuple[DAESolution, Any]:
         backwards = problem.t1 < problem.t0
         self = dataclasses.replace(self, formulation=self.formulation.towards(jnp.where(backwards, -1, 1)))
+        problem = from_fixed_start(self, problem)
         numbers, arrays = self.kernel(problem)
         forward, _ = self.forwards().kernel(problem)
         pull_back = self._pull_back(problem)

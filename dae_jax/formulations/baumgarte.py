@@ -15,7 +15,7 @@ from ..equations.constraint_jacobian import Rank
 from ..equations.manifold_ode import ManifoldODE
 from ..equations.structural_ode import underlying_ode
 from ..systems import System
-from ..types import Args, State, Time, Y
+from ..types import Args, BoolLike, State, Time, Y
 from .interface import AbstractFieldFormulation
 
 
@@ -34,7 +34,7 @@ class Baumgarte(AbstractFieldFormulation):
     - `alpha`, `beta`: α and β, in 1/s; arrays may be batched over and differentiated.
 
     Errors: `ValueError` for a negative α, with which errors grow; where α is traced, as in a batch, such a solve fails at its start
-    (`RESULTS.step_rejected`, or `RESULTS.not_finite` with fixed steps).
+    (`RESULTS.undefined_formulation`).
 
     Source: J. Baumgarte, Comput. Methods Appl. Mech. Eng. 1 (1972), 1–16.
     """
@@ -65,6 +65,9 @@ class Baumgarte(AbstractFieldFormulation):
                 f"`alpha` and `beta` of Baumgarte must be numbers, but have the shapes {np.shape(self.alpha)} and "
                 f"{np.shape(self.beta)}: batch over them with `jax.vmap`."
             )
+
+    def is_defined(self) -> BoolLike:
+        return ~(jnp.isnan(self.alpha) | jnp.isnan(self.beta))
 
     def towards(self, sign: Num[ArrayLike, ""]) -> Self:
         """With −α backwards in time: d/dt is −d/dτ in the time τ that the solve passes."""

@@ -12,7 +12,7 @@ from ..equations.constraint_jacobian import Rank
 from ..equations.linearised import LinearisedResidual
 from ..equations.manifold_ode import Equations
 from ..systems import System
-from ..types import Args, Flat, State, Time, Y
+from ..types import Args, BoolLike, Flat, State, Time, Y
 
 
 class AbstractFormulation(eqx.Module):
@@ -51,6 +51,10 @@ class AbstractFormulation(eqx.Module):
 
     def refuse(self, system: System) -> None:
         """Refuses, by a `ValueError` with advice, what the formulation is not for."""
+
+    def is_defined(self) -> BoolLike:
+        """Whether its parameters, which may be traced, are such as it takes."""
+        return True
 
     def towards(self, sign: Num[ArrayLike, ""]) -> Self:
         """The formulation for a solve in which time runs forwards, `sign` 1, or backwards, −1."""

@@ -100,6 +100,16 @@ def test_singular_and_indefinite(n):
     assert_expanded(lambda a: jnp.isnan(jnp.linalg.solve(a, jnp.ones(n))).any(), np.full((n, n), np.nan))
 
 
+@pytest.mark.parametrize("n", [3, 5])
+@pytest.mark.parametrize("value", [np.inf, np.nan])
+@pytest.mark.parametrize("row", [1, -1])
+def test_a_factor_beside_what_is_not_finite(n, value, row):
+    """LAPACK leaves what does not depend on it."""
+    a = 3 * np.eye(n) + 0.1
+    a[row, row] = value
+    assert_expanded(jnp.linalg.cholesky, a)
+
+
 @pytest.mark.parametrize("n", [3, 8])
 @pytest.mark.parametrize("flags", list(itertools.product([False, True], repeat=4)))
 def test_triangular_systems(n, flags):

@@ -233,3 +233,10 @@ def test_random_numbers():
         return [total, each, jax.random.normal(old, (3,)), *ends]
 
     same(fn, np.arange(LANES), np.random.default_rng(0).normal(size=(LANES, 2)), ulps=4)
+
+
+@pytest.mark.parametrize("n", [1, 2, 6, 100])
+@pytest.mark.parametrize("reverse", [False, True])
+def test_running_sums_of_negative_zeros(n, reverse):
+    """XLA begins those of several numbers at 0."""
+    same(lambda x: [LAX.cumsum(x, 0, reverse), LAX.cumsum(x.astype("float32"), 0, reverse)], np.full((LANES, n), -0.0))

@@ -132,6 +132,9 @@ def accumulated(name: str, dtype: str, draw: Draw) -> Operation:
     x = Operand(dtype, shape, "plain" if dtype in COMPLEX and name == "cumsum" else domain)
     axis, reverse = draw.below(len(x.shape)), draw.chance(0.5)
     fn = lambda a: getattr(lax, name)(a, axis=axis, reverse=reverse)
+    if name == "cumsum" and dtype in FLOATS and draw.chance(0.3):
+        # Zeros of both signs, whose sums have one.
+        return Operation(name, lambda a: fn(0 * a), (x,))
     return Operation(name, fn, (x,), smooth=dtype in FLOATS and name == "cumsum")
 
 

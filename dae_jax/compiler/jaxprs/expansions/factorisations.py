@@ -133,8 +133,9 @@ def _cholesky_written_out(a: Array) -> Any:
     found: list[list[Any]] = [[zero] * n for _ in range(n)]
     definite = jnp.bool_(True)
     for j in range(n):
+        # As in LAPACK, what is not a number spoils what follows from it only.
         square = a[j, j].real - sum((_size_squared(x) for x in found[j][:j]), jnp.zeros((), a.real.dtype))
-        definite &= square > 0
+        definite &= ~(square <= 0)
         root = jnp.sqrt(square)
         found[j][j] = root.astype(a.dtype)
         for i in range(j + 1, n):
@@ -157,7 +158,7 @@ def _cholesky_in_loop(a: Array) -> Any:
         square = rest[j].real
         root = jnp.sqrt(square)
         column = jnp.where(row > j, rest / root, jnp.where(row == j, root.astype(a.dtype), 0))
-        return found.at[:, j].set(column), definite & (square > 0)
+        return found.at[:, j].set(column), definite & ~(square <= 0)
 
     found, definite = jax.lax.fori_loop(0, n, column, (jnp.zeros_like(a), jnp.bool_(True)))
     return jnp.where(definite, found, jnp.nan)

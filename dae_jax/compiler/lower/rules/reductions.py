@@ -161,6 +161,9 @@ def running_extremum(context: Context, x: Operand, *, axis: int, reverse: bool) 
 def _running(context: Context, x: np.ndarray, axis: int, reverse: bool) -> np.ndarray:
     combine, out = _combine(context), np.moveaxis(x.copy(), axis, 0)
     out = out[::-1] if reverse else out
+    if _begins_at_zero(context, len(out)):
+        for j in np.ndindex(out.shape[1:]):
+            out[(0, *j)] = combine(_zero(context), out[(0, *j)])
     for i in range(1, len(out)):
         for j in np.ndindex(out.shape[1:]):
             out[(i, *j)] = combine(out[(i - 1, *j)], out[(i, *j)])
@@ -180,9 +183,24 @@ def _running_in_memory(context: Context, x: Operand, axis: int, reverse: bool) -
         found = _combine(context)(memory.entry(out, before), memory.entry(out, here))
         store(code, out.buffer, memory.at(out, here), found)
 
+    def begin(index: list[Index]) -> None:
+        here = [*index[:axis], out.shape[axis] - 1 if reverse else 0, *index[axis + 1 :]]
+        store(code, out.buffer, memory.at(out, here), _combine(context)(_zero(context), memory.entry(out, here)))
+
     with code.unmasked():
+        if _begins_at_zero(context, out.shape[axis]):
+            for_each(code, [1 if d == axis else n for d, n in enumerate(out.shape)], begin)
         for_each(code, turns, add)
     return out
+
+
+def _begins_at_zero(context: Context, entries: int) -> bool:
+    """Whether −0 is counted as 0, as XLA does in sums of several numbers."""
+    return context.name == "cumsum" and context.to.kind in "fc" and entries > 1
+
+
+def _zero(context: Context) -> Any:
+    return Complex(0.0, 0.0) if context.to.kind == "c" else context.to.type(0)
 
 
 @rule("argmax argmin", REALS | BOOL, cost=operand_size)
