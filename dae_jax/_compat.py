@@ -5,7 +5,11 @@ The value of a `RESULTS` is read as `result._value` where it is needed: a number
 
 from diffrax._root_finder import use_stepsize_tol as use_stepsize_tol
 from diffrax._term import WrapTerm as WrapTerm
-from equinox.internal import unvmap_any as unvmap_any, while_loop as while_loop
+from equinox.internal import (
+    nondifferentiable as nondifferentiable,
+    unvmap_any as unvmap_any,
+    while_loop as while_loop,
+)
 
 
 # Whose log has the traceback of an error that a callback raised, before JAX raises its own.

@@ -68,8 +68,19 @@ def _with_derivatives(ode: StructuralODE, t: Time, y: Float[Array, " n"]) -> Flo
     return jax.lax.fori_loop(0, CORRECTIONS, correct, state)
 
 
+@jax.custom_jvp
 def _pseudoinverse(a: Float[Array, "m k"]) -> Float[Array, "k m"]:
     """That of a matrix whose rows were scaled to 1, so that what is small beside 1 is round-off."""
     u, sizes, v = jnp.linalg.svd(a, full_matrices=False)
     kept = sizes > jnp.finfo(a.dtype).eps ** 0.75
     return (v.T * jnp.where(kept, 1 / jnp.where(kept, sizes, 1), 0)) @ u.T
+
+
+@_pseudoinverse.defjvp
+def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    # Of constant rank: Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973), eq. 4.12. Vectors of equal singular values have no derivative.
+    (a,), (da,) = primals, tangents
+    inverse = _pseudoinverse(a)
+    beside = inverse @ inverse.T @ (da - a @ (inverse @ da)).T
+    open_ones = (da - (da @ inverse) @ a).T @ inverse.T @ inverse
+    return inverse, beside + open_ones - inverse @ da @ inverse

@@ -96,7 +96,7 @@ def _efforts(
     reach = flat(jax.jacfwd(lambda q: jnp.stack([c(mechanism.configuration(q)) for c in along]))(q))
     free = _free(jnp.concatenate([jnp.delete(given, taken, axis=0), rolling]))
     wanted, can = -free @ (given[taken].T @ lam), free @ reach.T
-    tau = jnp.linalg.lstsq(can, wanted, rcond=_half_of_the_digits(can))[0]
+    tau = jnp.linalg.pinv(can, rtol=_half_of_the_digits(can)) @ wanted
     s = jnp.linalg.svd(_of_length_one(jnp.concatenate([given, rolling])), compute_uv=False)
     independent = s[(rank or len(s)) - 1] > NEAR * _half_of_the_digits(s) * s[0]
     tau = jnp.where(independent, tau, jnp.nan)
@@ -151,9 +151,9 @@ def _free(rows: Float[Array, "m n"]) -> Float[Array, "n n"]:
     n = rows.shape[1]
     if not len(rows):
         return jnp.eye(n, dtype=rows.dtype)
-    _, s, vt = jnp.linalg.svd(_of_length_one(rows), full_matrices=False)
-    held = vt * (s > _half_of_the_digits(rows) * s[0])[:, None]
-    return jnp.eye(n, dtype=rows.dtype) - held.T @ held
+    rows = _of_length_one(rows)
+    # Singular vectors of values that are equal, as those of one hinge are, have no derivative; the pseudoinverse has.
+    return jnp.eye(n, dtype=rows.dtype) - jnp.linalg.pinv(rows, rtol=_half_of_the_digits(rows)) @ rows
 
 
 def _of_length_one(rows: Float[Array, "m n"]) -> Float[Array, "m n"]:

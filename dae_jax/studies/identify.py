@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.special import gammaincc
 from jaxtyping import Array, Bool, Float, PyTree
 
+from .._compat import nondifferentiable
 from ..compiler import at_ease
 from ..solution import AccuracyWarning
 from ..types import BoolScalar, DType, Scalar
@@ -24,6 +25,11 @@ from .least_squares import Factors, Minimum, factors, minimum
 LOST = 1e-6
 # Where JAX refuses.
 ADVICE = "a `daesolve` in it needs `adjoint=diffrax.ForwardMode()`."
+# Where what `identify` returns is differentiated.
+NO_DERIVATIVE = (
+    "`identify` has no derivative by the data or by what `model` takes besides. That of the estimate is the solution of "
+    "d(Jᵀr) = 0 at `found.params`."
+)
 # Where the model is not finite at its start.
 AT_THE_START = (
     " So it is at the start, `params`: of a solve that failed with `throw=False`, or of a time that it did not reach, there are "
@@ -81,7 +87,7 @@ def identify(
     Errors: `ValueError` or `TypeError` for data, parameters or a model that are not finite, not real, or not of the shape they
     should have; `RuntimeError` where the minimum was not found, or what was found is a maximum, or a solve with `throw=True` failed
     on the way. Under `jit` and `vmap` there is no warning, and NaN in place of an error: a batch of
-    experiments is `jax.vmap(lambda d: identify(model, params, d))(data)`.
+    experiments is `jax.vmap(lambda d: identify(model, params, d))(data)`. It has no derivative.
 
     Sources: G. A. F. Seber, C. J. Wild, *Nonlinear Regression*, ch. 2 and 3; that of the method and its end in
     `dae_jax/studies/least_squares.py`.
@@ -153,7 +159,8 @@ def _identified(
     unit = 1.0 if sigmas is not None else unit.astype(dtype)
     found = _statistics(end, at(end.x), in_log, sigmas is not None, unit)
     residuals = unravel_data((-end.residual / weights).astype(measured.dtype))
-    return found._replace(residuals=residuals), failed
+    # Of a descent in which J stands for its own change, derivatives would be those of a linear model.
+    return nondifferentiable(found._replace(residuals=residuals), msg=NO_DERIVATIVE), failed
 
 
 def _statistics(

@@ -308,3 +308,22 @@ def test_multipliers_at_a_point_of_redundant_constraints_need_the_rank():
     # The force on q, λ₁ q + 2 λ₂ q, is the centripetal one.
     first, second = dae_jax.multipliers(doubled(1), *at)
     np.testing.assert_allclose(first + 2 * second, 4.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_drift_of_a_dae_has_its_derivative(mode):
+    """Off g = (|q|² − ℓ²)/2 and the hidden q·v, by ℓ and by v; singular values of the equations for ẏ are equal."""
+
+    def residual(t, y, yd, length):
+        q, v, tension = y[:2], y[2:4], y[4]
+        return jnp.concatenate([yd[:2] - v, yd[2:4] + tension * q, (q @ q - length**2)[None] / 2])
+
+    def found(x):
+        y = jnp.stack([0.6, 0.8, x[1], 0.3, 0.5])[None]
+        zero = jnp.zeros(())
+        sol = dae_jax.DAESolution(zero, zero + 1, zero[None], y, None, {}, dae_jax.RESULTS.successful, None, x[0], None)
+        return jnp.concatenate(dae_jax.drift(dae_jax.ImplicitDAE(residual), sol).levels[:2])
+
+    x = jnp.array([0.9, 0.2])
+    np.testing.assert_allclose(found(x), [(1 - 0.81) / 2, 0.36], rtol=1e-12)
+    np.testing.assert_allclose(mode(found)(x), [[-0.9, 0.0], [0.0, 0.6]], atol=1e-12)

@@ -69,12 +69,12 @@ def solved(mechanism, times=TIMES):
     )  # fmt: skip
 
 
-def along(mechanism, place, times):
-    """The solution with the positions `place(t)`, as if it had been solved for."""
+def along(mechanism, place, times, rank=None):
+    """The solution with the positions `place(t)`, as if it had been solved for; `rank` where they are traced."""
     q, v = jax.jit(jax.vmap(lambda t: jax.jvp(place, (t,), (jnp.ones(()),))))(jnp.asarray(times))
     names = tuple(body.name for body in mechanism.bodies)
     y0 = mechanism.reference
-    rank = mechanism.rank((Coordinates(q[0], names), y0[1]))[1]
+    rank = rank or mechanism.rank((Coordinates(q[0], names), y0[1]))[1]
     return dae_jax.DAESolution(
         times[0], times[-1], jnp.asarray(times), (Coordinates(q, names), Coordinates(v, names)), None, {},
         dae_jax.RESULTS.successful, None, None, rank,
@@ -208,6 +208,30 @@ def test_a_turn_in_space_about_a_tilted_axis():
     inertia = axis @ np.diag([0.1, 0.2, 0.3]) @ axis + 2.0 * 0.5**2
     weight = np.cross(np.asarray(sol.ys[0]["rod"])[:, :3], [0, 0, -2.0 * GRAVITY]) @ axis
     np.testing.assert_allclose(torque, inertia * 6 * np.asarray(times) - weight, atol=1e-8)
+
+
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_have_derivatives_where_constraints_are_perpendicular(mode):
+    """A rod on a hinge, θ = a t³: level, its constraints have singular values that are equal. By its mass, a and its inertia."""
+    times = jnp.linspace(0, 1, 6)
+
+    def turned(t, a):
+        return jnp.stack([0.5 * jnp.cos(a * t**3), 0.5 * jnp.sin(a * t**3), a * t**3])[None]
+
+    def found(x):
+        mass, a, inertia = x
+        rod = m.Body("rod", mass, inertia, at=(0.5, 0.0))
+        hinge = m.revolute(m.ground, rod, (0, 0), name="hinge")
+        motor = m.motor(hinge, motion=lambda t, args: a * t**3, name="motor")
+        mechanism = m.Mechanism([rod], [hinge], [m.gravity((0, -GRAVITY)), motor])
+        return mechanism.inverse_dynamics(along(mechanism, lambda t: turned(t, a), times, rank=3), ["hinge"])["hinge"]
+
+    def exact(x):
+        mass, a, inertia = x
+        return (inertia + mass / 4) * 6 * a * times + mass * GRAVITY / 2 * jnp.cos(a * times**3)
+
+    x = jnp.array([2.0, 1.3, 0.4])
+    np.testing.assert_allclose(jax.jit(mode(found))(x), jax.jacfwd(exact)(x), rtol=1e-10, atol=1e-10)
 
 
 def test_a_path_in_the_axes_of_a_body_that_moves():

@@ -449,3 +449,12 @@ def test_a_maximum_is_no_end():
     ends = jax.vmap(fixed)(jnp.array([opposite, opposite - 0.5, opposite - 2]))
     assert np.isnan(ends[0])
     np.testing.assert_allclose(ends[1:], opposite - np.pi, atol=1e-9)
+
+
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_has_no_derivative(mode):
+    """It would be that of a linear model, some per cent off without a word."""
+    model = lambda p: p[0] * jnp.cos(jnp.arange(6.0)) + jnp.sin(p[1]) * jnp.sin(jnp.arange(6.0))
+    found = lambda data: dae_jax.identify(model, jnp.array([1.0, 0.5]), data, positive=False).params
+    with pytest.raises(RuntimeError, match="no derivative by the data"):
+        mode(found)(model(jnp.array([1.2, 0.7])) + 0.1)
