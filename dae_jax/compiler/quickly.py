@@ -6,6 +6,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
+from jax.core import Tracer
 
 from ._compat import accepted_options, trace_state_clean
 
@@ -27,7 +28,7 @@ def quickly_compiled(fn: Callable[P, T]) -> Callable[P, T]:
     @functools.wraps(fn)
     def called(*args: P.args, **kwargs: P.kwargs) -> T:
         arrays = [x for x in jax.tree.leaves((args, kwargs)) if eqx.is_array(x)]
-        few = sum(x.size for x in arrays) <= FEW and not any(isinstance(x, jax.core.Tracer) for x in arrays)
+        few = sum(x.size for x in arrays) <= FEW and not any(isinstance(x, Tracer) for x in arrays)
         if not few or not trace_state_clean() or jax.default_backend() != "cpu":
             return usual(*args, **kwargs)
         return quick()(*args, **kwargs)

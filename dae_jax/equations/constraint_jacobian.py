@@ -124,9 +124,10 @@ class SparseNormals:
         if mass is not None and mass.ndim == 3:
             seeds = _unweighted(mass, seeds)
         compressed = self._compressed(ode, t, q, seeds)
-        looped = isinstance(self.gram, SparseDefinite)
-        factors = self.gram.factors(*self._products(ode, q, compressed)) if looped else ()
-        return jnp.asarray(t, q.dtype), q, compressed, *factors
+        point = jnp.asarray(t, q.dtype), q, compressed
+        if not isinstance(self.gram, SparseDefinite):
+            return point
+        return *point, *self.gram.factors(*self._products(ode, q, compressed))
 
     def _compressed(
         self, ode: Mechanism, t: Time, q: Flat, seeds: Float[Array, "colours n"]

@@ -39,12 +39,6 @@ class TestPackage:
         if kind != "lax":
             assert jax.grad(loop)(2.0) == 192.0
 
-    def test_nothing_is_traced_here(self):
-        assert _compat.trace_state_clean()
-        seen = []
-        jax.jit(lambda x: seen.append(_compat.trace_state_clean()) or x)(1.0)
-        assert seen == [False]
-
     def test_messages_of_results(self):
         assert _compat.messages(RESULTS)[int(RESULTS.successful._value)] == "successful"
         assert "maximum number of solver steps" in _compat.messages(RESULTS)[int(RESULTS.max_steps_reached._value)]
@@ -64,6 +58,27 @@ class TestPackage:
 
 
 class TestCompiler:
+    def test_nothing_is_traced_here(self):
+        assert of_compiler.trace_state_clean()
+        seen = []
+        jax.jit(lambda x: seen.append(of_compiler.trace_state_clean()) or x)(1.0)
+        assert seen == [False]
+
+    def test_what_is_computed_now(self):
+        seen = []
+
+        @jax.jit
+        def traced(x):
+            with of_compiler.evaluated_now():
+                seen.append(float(jnp.sin(jnp.asarray(1.0))))
+            return x
+
+        traced(1.0)
+        with of_compiler.evaluated_now():
+            # What is traced here has its constants in it.
+            seen.append(len(jax.make_jaxpr(lambda x: x + jnp.arange(3.0))(1.0).eqns))
+        assert seen == [pytest.approx(np.sin(1.0)), 2]
+
     def test_jax_has_started(self):
         jnp.zeros(1).block_until_ready()
         assert of_compiler.backends_are_initialised()

@@ -100,7 +100,7 @@ def eigh(context: Context, a: Operand, *, lower: bool, **_: object) -> list[Any]
         jax.ShapeDtypeStruct((3 + 5 * n,), np.int32),
     )
     call = functools.partial(_call, context, decompose, "V", "L" if lower else "U", n)
-    vectors, values, _, _, outcome = _on_copies(
+    vectors, values, *_rooms, outcome = _on_copies(
         context,
         [_transposed(_numbers(context, a, 0)), values, room, whole, _OUTCOME],
         lambda a, values, room, whole, outcome: call(a, n, values, room, room.size, whole, whole.size, outcome),
