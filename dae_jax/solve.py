@@ -12,7 +12,9 @@ from jax.core import Tracer
 
 from .compiler import at_ease, evaluated_now
 from .compiler.types import Arrays
+from .consistent import Violation
 from .driver.doubts import warn
+from .driver.ends import Start
 from .driver.event_functions import refuse_other_outputs
 from .driver.failures import OKAY, below_roundoff, in_words, not_finite_beyond, raised_in_the_program, undetermined
 from .driver.options import refuse_misfits, refuse_no_event, refuse_other_steps, refuse_wrong_options
@@ -117,12 +119,12 @@ def daesolve(
     program, arrays = split((solve, problem))
     before = traces()
     if any(isinstance(x, Tracer) for x in arrays):
-        sol, *_ = run(program, arrays)
+        sol, start, _ = run(program, arrays)
     else:
-        sol = _run_on_numbers(program, arrays, solve, problem)
+        sol, start = _run_on_numbers(program, arrays, solve, problem)
     if traces() != before:
         settle(program.leaves)
-    sol = _raise_if_failed(sol, solve, problem) if throw else sol
+    sol = _raise_if_failed(sol, solve, problem, start.off) if throw else sol
     if not isinstance(sol.stats["doubts"], Tracer):
         warn(sol, stacklevel=2)
     return sol
@@ -213,24 +215,24 @@ def _found_of_structure(program: Program, shapes: tuple[jax.ShapeDtypeStruct, ..
     return found[0]
 
 
-def _run_on_numbers(program: Program, arrays: Arrays, solve: Solve, problem: Problem) -> DAESolution:
+def _run_on_numbers(program: Program, arrays: Arrays, solve: Solve, problem: Problem) -> tuple[DAESolution, Start]:
     """`run`, refusing an inconsistent start in words. How many constraints are independent is found, and remembered, where it
     is not all of them.
     """
     known = _of_known_rank.get(program)
     if known is None:
         known = _with_rank(program, solve, problem) if _asks_for_rank(program, solve, problem) else program
-    sol, as_expected, seconds = run(known, arrays)
+    sol, start, seconds = run(known, arrays)
     # Inside an outer `jit` the result is no number, although the inputs are: they are looked at each time it is traced.
-    inside = isinstance(as_expected, Tracer)
-    if inside or not as_expected:
+    inside = isinstance(start.surely, Tracer)
+    if inside or not start.surely:
         better = _with_rank(program, solve, problem)
         if better != known:
-            sol, _, more = run(better, arrays)
+            sol, start, more = run(better, arrays)
             seconds += more
     if not inside:
         sol.stats["compile_seconds"] = seconds
-    return sol
+    return sol, start
 
 
 def _with_rank(program: Program, solve: Solve, problem: Problem) -> Program:
@@ -282,9 +284,9 @@ _UNDERLYING_ODE = Differentiation()
 _PID64, _PID32 = (diffrax.PIDController(rtol=tolerance, atol=tolerance) for tolerance in (1e-8, 1e-5))
 
 
-def _raise_if_failed(sol: DAESolution, solve: Solve, problem: Problem) -> DAESolution:
+def _raise_if_failed(sol: DAESolution, solve: Solve, problem: Problem, off: Violation | None) -> DAESolution:
     if isinstance(sol.result._value, Tracer):
-        return raised_in_the_program(sol, problem)
+        return raised_in_the_program(sol, problem, off)
     if int(sol.result._value) in OKAY:
         return sol
     beyond = not_finite_beyond(sol, problem)

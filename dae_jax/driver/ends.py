@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from ..consistent import unsolved, violation
+from ..consistent import Violation, unsolved, violation
 from ..equations.constraint_jacobian import Rank
 from ..equations.independent import Rows, independent
 from ..equations.mechanical import MechanicalODE
@@ -24,11 +24,13 @@ SINGULAR = 1 / 3
 
 class Start(NamedTuple):
     """What is wrong with a start: 0 for nothing, 1: it is inconsistent, 2: the constraints have not the given rank (`None`:
-    all are independent), 3: the masses, 4: several ẏ satisfy the equations; and whether nothing is wrong beyond doubt.
+    all are independent), 3: the masses, 4: several ẏ satisfy the equations; whether nothing is wrong beyond doubt; and of a
+    mechanism how far it is from its constraints.
     """
 
     wrong: Int[Array, ""]
     surely: Bool[Array, ""]
+    off: Violation | None = None
 
 
 class End(NamedTuple):
@@ -65,14 +67,14 @@ def look(
         return _look_at_equations(system, t0, start, args, end, tolerances)
     ode = MechanicalODE.of(system, t0, start, args, rank)
     y, (t, y_end) = ode.encode(start), (end[0], ode.encode(end[1]))
-    consistent, regular = violation(ode, t0, y).consistent(), mass_is_regular(ode, y[0], invertible)
+    off, regular = violation(ode, t0, y), mass_is_regular(ode, y[0], invertible)
     fits, surely = has_rank(ode, t0, y, ode.rank)
     some = ode
     if rows is not None:
         some = MechanicalODE.of(independent(system, t0, start, args, ode.rank, rows), t0, start, args)
         fits, surely = (a & b for a, b in zip((fits, surely), has_rank(some, t0, y, None), strict=True))
-    wrong = jnp.where(regular, jnp.where(consistent, jnp.where(fits, 0, 2), 1), 3)
-    at_start = Start(wrong, (wrong == 0) & surely)
+    wrong = jnp.where(regular, jnp.where(off.consistent(), jnp.where(fits, 0, 2), 1), 3)
+    at_start = Start(wrong, (wrong == 0) & surely, off)
 
     near, drifted = is_near_constraints(ode, t, y, y_end, keeps, tolerances, residual)
     yes = jnp.asarray(True)

@@ -160,15 +160,23 @@ def _of_one(off: Violation, number: int, axes: int) -> Violation:
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[axes:])[number if x.shape[:axes] != (1,) * axes else 0], off)
 
 
-def raised_in_the_program(sol: DAESolution, problem: Problem) -> DAESolution:
-    """`sol` of a problem, in a program in which it raises a `SolveFailed` where it is evaluated and has failed."""
+def raised_in_the_program(sol: DAESolution, problem: Problem, off: Violation | None) -> DAESolution:
+    """`sol` of a problem, in a program in which it raises a `SolveFailed` where it is evaluated and has failed; `off`: how far its
+    start is from the constraints, if that is known.
+    """
     okay = jnp.any(jnp.stack([sol.result._value == code for code in OKAY]))
     arrays, rest = eqx.partition(sol, eqx.is_array)
     details = jax.tree.map(jnp.asarray, lax.stop_gradient(_details(sol)))
-    # Apart, as functions of the problem may close over what is traced.
-    program, numbers = split(problem)
-    start = functools.partial(_off, program)
-    return eqx.combine(_passed(arrays, ~okay, details, start, lax.stop_gradient(numbers)), rest)
+    find, numbers = _as_it_is, off
+    if off is None:
+        # Apart, as functions of the problem may close over what is traced.
+        program, numbers = split(problem)
+        find = functools.partial(_off, program)
+    return eqx.combine(_passed(arrays, ~okay, details, find, lax.stop_gradient(numbers)), rest)
+
+
+def _as_it_is(off: Violation) -> Violation:
+    return off
 
 
 # A custom derivative, so that the branch is none in a derivative, which fails where the solve does also if only it is asked for.
@@ -177,11 +185,11 @@ def _passed(
     arrays: PyTree[Array],
     failed: BoolScalar,
     details: tuple[Array, ...],
-    off: Callable[[list[Array]], Violation | None],
-    start: list[Array],
+    find: Callable[[Any], Violation | None],
+    start: PyTree[Array],
 ) -> Any:
     shapes = jax.eval_shape(lambda: arrays)
-    fail = lambda: jax.pure_callback(_raise_of, shapes, off(start), *details, vmap_method="expand_dims")
+    fail = lambda: jax.pure_callback(_raise_of, shapes, find(start), *details, vmap_method="expand_dims")
     return lax.cond(unvmap_any(failed), fail, lambda: arrays)
 
 

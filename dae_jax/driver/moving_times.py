@@ -18,6 +18,7 @@ from jaxtyping import Array, PyTree
 from ..solution import RESULTS, DAESolution
 from ..types import Scalar, State
 from ..validate.captured import settled
+from .ends import Start
 from .problem import Problem, split
 from .rates import Rates, chooses_steps, have_rates, plus
 from .start import is_saved_part
@@ -58,7 +59,7 @@ def from_fixed_start(solve: "Solve", problem: Problem) -> Problem:
     return dataclasses.replace(problem, y0=y0, t0=lax.stop_gradient(problem.t0))
 
 
-def with_moving_times(solved: Callable[..., Any], solve: "Solve", problem: Problem) -> tuple[DAESolution, Any]:
+def with_moving_times(solved: Callable[..., Any], solve: "Solve", problem: Problem) -> tuple[DAESolution, Start]:
     """`solved(solve, problem)`, of which what was saved moves with its times."""
     if not have_rates(problem):
         return solved(solve, problem)
@@ -67,9 +68,9 @@ def with_moving_times(solved: Callable[..., Any], solve: "Solve", problem: Probl
     ends = {"t0": problem.t0, "t1": problem.t1} if chosen else {}
     held = dataclasses.replace(problem, t1=fixed(problem.t1), dt0=fixed(problem.dt0)) if chosen else problem
     still = _with_times(solve, fixed(times))
-    sol, as_expected = solved(still, held)
+    sol, start = solved(still, held)
     if not (chosen or jax.tree.leaves(times)):
-        return sol, as_expected
+        return sol, start
     program, arrays = split((still, held))
 
     @eqx.filter_custom_jvp
@@ -93,7 +94,7 @@ def with_moving_times(solved: Callable[..., Any], solve: "Solve", problem: Probl
     also = {"code": sol.result._value, "changed": sol.changed}
     found = moving({**saved, **also}, {**ends, "ts": times}, arrays)
     stats = {**sol.stats, "end_time": found["end_time"]}
-    return dataclasses.replace(sol, **{k: found[k] for k in ("t0", "t1", "ts", "ys")}, stats=stats), as_expected
+    return dataclasses.replace(sol, **{k: found[k] for k in ("t0", "t1", "ts", "ys")}, stats=stats), start
 
 
 def _with_times(solve: "Solve", times: list[Any]) -> "Solve":

@@ -34,7 +34,7 @@ def judged(
     that is.
     """
     t0, t1, ts, ys, interpolation, stats, code, event_mask, seen = out
-    (start, _), end, (finite_end, defined) = found
+    start, end, (finite_end, defined) = found
     failed = lambda name, instead, when=True: RESULTS.where((code == name) & when, instead, code)
     if takes_residuals(solve.solver):
         code = failed(RESULTS.dt_min_reached, RESULTS.error_too_large)
@@ -69,7 +69,7 @@ def judged(
     for wrong, name in enumerate(
         ("inconsistent_start", "dependent_constraints", "irregular_mass", "ambiguous_start"), 1
     ):
-        code = RESULTS.where(start == wrong, getattr(RESULTS, name), code)
+        code = RESULTS.where(start.wrong == wrong, getattr(RESULTS, name), code)
     defined = solve.formulation.is_defined()
     code = code if defined is True else RESULTS.where(jnp.asarray(defined), code, RESULTS.undefined_formulation)
     # diffrax has no step to take where its comparisons with NaN are false.

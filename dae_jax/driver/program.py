@@ -9,6 +9,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import PyTree
 
 from .._compat import is_captured, lacks_reverse_derivatives
@@ -26,7 +27,7 @@ from ..validate.captured import settled
 from ..validate.user_functions import refuse_wrong_functions, returned
 from .changes import changing, some_changes, with_changes
 from .diffrax_call import Decode, View, call, failed, steps_of
-from .ends import look
+from .ends import Start, look
 from .event_functions import known_to_conditions, refuse_wrong_event
 from .failures import refused_on_the_way
 from .felt_steps import OneDirection, by_felt_steps
@@ -60,18 +61,19 @@ def _make_room() -> None:
         jax.clear_caches()
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def _jitted(program: Program, arrays: Arrays) -> Any:
+@functools.partial(jax.jit, static_argnums=(0, 2))
+def _jitted(program: Program, arrays: Arrays, within: bool) -> Any:
+    """`within` other programs also how far the start is from the constraints: there it cannot be found afterwards."""
     _traced.append(program)
     solve, problem = program.whole(jax.tree.map(jnp.asarray, arrays))
     waiting.begin(always=not isinstance(solve.progress_meter, diffrax.NoProgressMeter))
     solve.refuse_wrong_functions(problem)
     with settled(program.leaves):
-        sol, as_expected = with_moving_times(_solved, solve, problem)
-    return Split.of(sol), as_expected
+        sol, start = with_moving_times(_solved, solve, problem)
+    return Split.of(sol), start if within else start._replace(off=None)
 
 
-def _solved(solve: "Solve", problem: Problem) -> tuple[DAESolution, Any]:
+def _solved(solve: "Solve", problem: Problem) -> tuple[DAESolution, Start]:
     return solve_with_resets(solve, problem) if isinstance(solve.event, Reset) else solve(problem)
 
 
@@ -88,11 +90,12 @@ def _refuse_reverse(*_: object) -> Any:
     raise TypeError(FORWARD_ONLY)
 
 
-def run(program: Program, arrays: Arrays) -> tuple[DAESolution, Any, float]:
-    """The solution, whether the start was consistent and of the given rank, and the seconds spent on compiling."""
+def run(program: Program, arrays: Arrays) -> tuple[DAESolution, Start, float]:
+    """The solution, what its start was like, and the seconds spent on compiling."""
     _make_room()
+    within = not trace_state_clean() or any(isinstance(x, Tracer) for x in arrays)
     try:
-        sol, as_expected = _jitted(program, arrays)
+        sol, start = _jitted(program, arrays, within)
     except TypeError as error:
         if is_captured(error):
             raise TypeError(
@@ -106,7 +109,7 @@ def run(program: Program, arrays: Arrays) -> tuple[DAESolution, Any, float]:
         raise
     finally:
         seconds = waiting.end(all_made=True)
-    return sol.whole(), as_expected, seconds
+    return sol.whole(), start, seconds
 
 
 @functools.partial(
@@ -131,7 +134,7 @@ class Solve:
     # Whether the dense output is there for the tape alone.
     recording: bool = False
 
-    def __call__(self, problem: Problem) -> tuple[DAESolution, Any]:
+    def __call__(self, problem: Problem) -> tuple[DAESolution, Start]:
         backwards = problem.t1 < problem.t0
         self = dataclasses.replace(self, formulation=self.formulation.towards(jnp.where(backwards, -1, 1)))
         problem = from_fixed_start(self, problem)
@@ -142,9 +145,9 @@ class Solve:
         kind = self.derivative() if way is None else "reverse"
         *fields, end, _ = one_kernel(numbers, kind, pull_back, forward, way)(arrays).whole()
         check, check_arrays = self._check(problem, end)
-        # A yes or no has no derivative.
+        # What is looked at has no derivative.
         found = one_kernel(check, self.derivative(), often=False)(jax.lax.stop_gradient(check_arrays))
-        return judged(self, fields, problem, found, end), found[0][1]
+        return judged(self, fields, problem, found, end), found[0]
 
     def keeps(self) -> tuple[bool, bool]:
         """Whether g and (ġ, h) hold at each step."""

@@ -21,6 +21,7 @@ from ..systems import System
 from ..types import Args, Scalar, State, Time
 from ..validate.states import NUMBERS, brief
 from .bracket import Bracket
+from .ends import Start
 from .problem import Problem, count_of, split
 from .reset_levels import FromStart, level_at_start
 from .start import saved_parts
@@ -110,7 +111,7 @@ class _Progress(NamedTuple):
     moved: Float[Array, ""]
 
 
-def solve_with_resets(solve: "Solve", problem: Problem) -> tuple[DAESolution, Any]:
+def solve_with_resets(solve: "Solve", problem: Problem) -> tuple[DAESolution, Start]:
     """What `solve` gives, part by part; `solve.event` is a `Reset`."""
 
     def parts(solve: "Solve") -> tuple[Callable[[Arrays], Split], Arrays]:
@@ -122,7 +123,7 @@ def solve_with_resets(solve: "Solve", problem: Problem) -> tuple[DAESolution, An
     return one_kernel(numbers, solve.derivative(), None, forward)(arrays).whole()
 
 
-def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Any]:
+def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Start]:
     system, t0, y0, args = problem.start
     t1, rank = problem.t1, problem.rank
     reset, (output,) = solve.event, saved_parts(solve.saveat)
@@ -214,7 +215,8 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Any]:
         RESULTS.irregular_mass,
         RESULTS.ambiguous_start,
     )
-    return sol, ~jnp.any(jnp.stack([p.code == code._value for code in refused]))
+    fine = ~jnp.any(jnp.stack([p.code == code._value for code in refused]))
+    return sol, Start(jnp.where(fine, 0, 1), fine)
 
 
 def _is_number(x: object) -> bool:

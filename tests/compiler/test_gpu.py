@@ -97,7 +97,7 @@ def test_a_method_as_threads(method, gradient, monkeypatch, tmp_path, capsys):
     """Every method, its solve and its gradient: threads give what the lanes of vectors give, and NVIDIA's assembler takes their program."""
     fn, seen = derived(method, gradient), []
 
-    def compiled(jaxpr, lanes, target=None):
+    def compiled(jaxpr, lanes, **_):
         if not any(lanes):
             return before(jaxpr, lanes)
         seen.append((jaxpr, tuple(lanes)))

@@ -125,9 +125,9 @@ class TestCheck:
         right = module.register
         before, after = (f" = {code} " for code in wrong)
 
-        def mutated(text, source):
+        def mutated(text, *args):
             assert before in text
-            return right(text.replace(before, after), source)
+            return right(text.replace(before, after), *args)
 
         monkeypatch.setattr(module, "register", mutated)
         with configure(check=True), pytest.raises(Exception, match=words):

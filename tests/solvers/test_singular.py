@@ -167,7 +167,7 @@ class TestLeavesAllBounds:
                 solve(pendulum(), diffrax.Tsit5(), formulation=dae_jax.Baumgarte(a, 1.0), throw=False).result._value
             )
         )
-        assert int(result(-100.0)) == code(RESULTS.step_rejected)
+        assert int(result(-100.0)) == code(RESULTS.undefined_formulation)
         assert int(result(5.0)) == code(RESULTS.successful)
 
 
