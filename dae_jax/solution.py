@@ -153,12 +153,10 @@ class Interpolation(eqx.Module):
     path: diffrax.DenseInterpolation
     # `decode(t, y, ode)`, and its `ode`.
     view: Split
-    # Whether `decode` knows by itself how the state moves with t.
-    still: bool = eqx.field(static=True, default=False)
 
     @classmethod
-    def of(cls, path: diffrax.DenseInterpolation, decode: Callable[..., Any], ode: Any, still: bool) -> "Interpolation":
-        return cls(path, Split.to_return((decode, ode)), still)
+    def of(cls, path: diffrax.DenseInterpolation, decode: Callable[..., Any], ode: Any) -> "Interpolation":
+        return cls(path, Split.to_return((decode, ode)))
 
     @at_ease
     def evaluate(self, t0: Time, t1: Time | None = None, left: bool = True) -> Any:
@@ -166,8 +164,7 @@ class Interpolation(eqx.Module):
         if t1 is not None:
             return jax.tree.map(lambda a, b: b - a, self.evaluate(t0, left=left), self.evaluate(t1, left=left))
         decode, ode = self.view.whole()
-        at = jax.lax.stop_gradient(t0) if self.still else t0
-        return decode(t0, self.path.evaluate(at, left=left), ode)
+        return decode(t0, self.path.evaluate(t0, left=left), ode)
 
 
 class DAESolution(eqx.Module):

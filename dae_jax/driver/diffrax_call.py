@@ -35,7 +35,6 @@ from .followed_steps import RecordedEnds, Steps, at_steps, taken
 from .observed_steps import Observer, observed
 from .passages import passages
 from .problem import Problem
-from .rates import Moving, Rates, Still, chooses_steps, have_rates
 from .start import is_saved_part
 from .summed_errors import SummedErrors
 from .switches import stepped_over
@@ -63,7 +62,7 @@ class View(eqx.Module):
     """What is saved of a point of the solver's dense output."""
 
     fn: Callable[..., Any]
-    decode: Callable[..., Any]
+    decode: Decode
     args: Any
 
     def __call__(self, t: Time, y: Y, ode: Equations) -> Any:
@@ -76,11 +75,7 @@ def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[
     """
     t0, t1, dt0, args = problem.t0, problem.t1, problem.dt0, problem.args
     y, ode = solve.encoded(problem)
-    decode: Any = Decode(solve.formulation, solve.solver)
-    still = chooses_steps(solve) and have_rates(problem)
-    moving = Moving(decode, Rates.of(solve, problem)) if still else decode
-    # No time has a derivative then but that of an event.
-    decode = decode if solve.event is None else moving
+    decode = Decode(solve.formulation, solve.solver)
     solver, controller = economical(solve.solver, solve.between()), _fitted(solve.controller)
     _refuse_other_tolerances(controller, y)
     felt = SMALL * jax.lax.stop_gradient(jnp.abs(t1 - t0)) if isinstance(solve.adjoint, OneDirection) else None
@@ -109,7 +104,6 @@ def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[
     sums_errors = _may_ignore_errors(solve.controller) and not solve.recording
     observers: dict[str, Observer] = {"errors": SummedErrors()} if sums_errors else {}
     looped = _for_loops(solve, solver, y, _real(event, t0, y, ode), t0, t1)
-    looped = Still(looped) if still and event is not None else looped
     records = steps is None and (felt is not None or solve.records_steps())
     if records:
         assert solve.max_steps is not None
@@ -138,7 +132,7 @@ def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[
     path = sol.interpolation
     if path is not None and isinstance(solver, AbstractManifoldSolver):
         path = solver.whole_path(path)
-    interpolation = None if path is None else Interpolation.of(path, moving, ode, still)
+    interpolation = None if path is None else Interpolation.of(path, decode, ode)
     ts, ys = cast(Any, sol.ts), cast(Any, sol.ys)
     end = jax.lax.stop_gradient(jax.tree.map(lambda x: x[-1], (ts["end"], ys["end"])))
     stats = {**sol.stats, "end_time": ts["end"][-1]}

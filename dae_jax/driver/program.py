@@ -32,7 +32,6 @@ from .event_functions import known_to_conditions, refuse_wrong_event
 from .failures import refused_on_the_way
 from .felt_steps import OneDirection, by_felt_steps
 from .followed_steps import Steps, as_bits, if_reached, of_bits
-from .moving_times import from_fixed_start, with_moving_times
 from .outcome import judged
 from .problem import Problem, Program, split
 from .resets import Reset, solve_with_resets
@@ -69,12 +68,8 @@ def _jitted(program: Program, arrays: Arrays, within: bool) -> Any:
     waiting.begin(always=not isinstance(solve.progress_meter, diffrax.NoProgressMeter))
     solve.refuse_wrong_functions(problem)
     with settled(program.leaves):
-        sol, start = with_moving_times(_solved, solve, problem)
+        sol, start = solve_with_resets(solve, problem) if isinstance(solve.event, Reset) else solve(problem)
     return Split.of(sol), start if within else start._replace(off=None)
-
-
-def _solved(solve: "Solve", problem: Problem) -> tuple[DAESolution, Start]:
-    return solve_with_resets(solve, problem) if isinstance(solve.event, Reset) else solve(problem)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -137,7 +132,6 @@ class Solve:
     def __call__(self, problem: Problem) -> tuple[DAESolution, Start]:
         backwards = problem.t1 < problem.t0
         self = dataclasses.replace(self, formulation=self.formulation.towards(jnp.where(backwards, -1, 1)))
-        problem = from_fixed_start(self, problem)
         numbers, arrays = self.kernel(problem)
         forward, _ = self.forwards().kernel(problem)
         pull_back = self._pull_back(problem)
