@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
-from ..linalg import factorised, minor_sign, row_products, semidefinite_solve, smallest_pivot
+from ..linalg import factorised, minor_sign, row_products, semidefinite_solve, smallest_pivot, solve_with
 from ..types import IntScalar, Phase, Time
-from .constraint_jacobian import Rank, SparseNormals, mass_solve, matvec, of_rows, unit_diagonal
+from .constraint_jacobian import Rank, SparseNormals, mass_solve, matvec, unit_diagonal
 from .mechanical import MechanicalODE, allowed_contradiction
 
 
@@ -231,11 +231,12 @@ def _drifted_over(ode: MechanicalODE, t: Time, y: Phase, g: Float[Array, "m n"])
     """
     gram, lifted, scale = _gram(ode, y, g)
     rank = None if ode.rank is None else ode.rank[0]
-    off, matrix = ode.constraint(t, y[0]), gram
-    if rank is not None:
-        kept = factorised(gram * scale[:, None] * scale, ((len(g), rank),)).kept()
-        off, matrix = kept * off, of_rows(gram, kept)
-    multipliers = semidefinite_solve(matrix, off)
+    off = ode.constraint(t, y[0])
+    if rank is None:
+        multipliers = semidefinite_solve(gram, off)
+    else:
+        scaled = gram * scale[:, None] * scale
+        multipliers = scale * solve_with(factorised(scaled, ((len(g), rank),)), scaled, scale * off)
     nearest = y[0] - matvec(lifted.T, multipliers)
     change = row_products(jax.jacfwd(ode.constraint, 1)(t, nearest), lifted) - gram
     return _is_turned(gram + FAR * change, scale, rank) | _is_turned(gram - FAR * change, scale, rank)
