@@ -22,6 +22,7 @@ from .jaxprs.walk import (
 )
 from .jit import Jitted as Jitted, compiles as compiles, jit as jit
 from .kernel_call import Decision as Decision, decision as decision, hindrances as hindrances
+from .linear_map import Moving as Moving
 from .one_kernel import (
     PullBack as PullBack,
     inexact as inexact,

@@ -24,6 +24,9 @@ from .kernel_call import as_kernel
 
 Arrays = list[Any]
 
+# Which of some arrays move, where a derivative is asked for.
+Moving = tuple[bool, ...]
+
 # Which axis of each array is that of a batch.
 Axes = Sequence[int | None]
 
@@ -32,14 +35,14 @@ Axes = Sequence[int | None]
 class LinearMap:
     """x ↦ A(at) x for lists of arrays, `apply(at, x)`.
 
-    `transposed()` is y ↦ A(at)ᵀ y. `change()` is how A(at) x changes with the inexact arrays in `at`, a linear map of their
-    changes at [*at, *x]. `inexact`: which arrays in `at` are.
+    `transposed()` is y ↦ A(at)ᵀ y. `change(moving)` is how A(at) x changes with those arrays in `at`, a linear map of their changes at
+    [*at, *x]. `inexact`: which arrays in `at` can move.
     """
 
     apply: Callable[[Arrays, Arrays], Arrays]
     inexact: Sequence[bool]
     transposed: Callable[[], "LinearMap"]
-    change: Callable[[], "LinearMap"]
+    change: Callable[[Moving], "LinearMap"]
 
     def __call__(self, at: Sequence[Array], x: Sequence[Array], shapes: Sequence[Array | ShapedArray]) -> Arrays:
         """A(at) x, whose arrays have the shapes and types of these."""
@@ -66,14 +69,14 @@ def is_inexact(x: ArrayLike) -> bool:
     return jnp.issubdtype(jnp.result_type(x), jnp.inexact)
 
 
-def moved(fn: Callable[[Arrays], Arrays], at: Arrays, changes: Arrays) -> Arrays:
-    """How `fn(at)` changes with the inexact arrays in `at`."""
+def moved(fn: Callable[[Arrays], Arrays], at: Arrays, moving: Moving, changes: Arrays) -> Arrays:
+    """How `fn(at)` changes with the arrays in `at` that are `moving`."""
 
-    def of_inexact(*zs: Array) -> Arrays:
+    def of_moving(*zs: Array) -> Arrays:
         rest = iter(zs)
-        return fn([next(rest) if is_inexact(x) else x for x in at])
+        return fn([next(rest) if m else x for x, m in zip(at, moving, strict=True)])
 
-    return jax.jvp(of_inexact, tuple(filter(is_inexact, at)), tuple(changes))[1]
+    return jax.jvp(of_moving, tuple(x for x, m in zip(at, moving, strict=True) if m), tuple(changes))[1]
 
 
 def forward_map(
@@ -91,11 +94,9 @@ def forward_map(
             "`adjoint=diffrax.ForwardMode()` with `jax.jacfwd` throughout."
         )
 
-    def changed(at: Arrays, changes: Arrays) -> Arrays:
-        return moved(lambda a: fn(a, at[n:]), at[:n], changes)
-
-    def change() -> LinearMap:
-        return forward_map(changed, [*inexact, *[True] * count], sum(inexact))
+    def change(moving: Moving) -> LinearMap:
+        changed = lambda at, changes: moved(lambda a: fn(a, at[n:]), at[:n], moving, changes)
+        return forward_map(changed, [*inexact, *[True] * count], sum(moving))
 
     return LinearMap(as_kernel(fn), inexact, transposed or no_transpose, change)
 
@@ -128,12 +129,12 @@ def derivative_map(
         values, xs = of_moving(at)
         return list(jax.vjp(values, *xs)[1](list(cotangents)))
 
-    def change(apply: Callable[[Arrays, Arrays], Arrays], of: int, found: int) -> LinearMap:
-        also, still = [*inexact, *[True] * of], [*inexact, *[False] * of]
+    def change(apply: Callable[[Arrays, Arrays], Arrays], of: int, found: int, moving: Moving) -> LinearMap:
+        also, still = [*inexact, *[True] * of], [*moving, *[False] * of]
         return derivative_map(lambda xs: apply(xs[:n], xs[n:]), also, still, found, kernel)
 
-    push = LinearMap(kernel(pushed), inexact, lambda: pull, lambda: change(pushed, count, results))
-    pull = LinearMap(kernel(pulled), inexact, lambda: push, lambda: change(pulled, results, count))
+    push = LinearMap(kernel(pushed), inexact, lambda: pull, lambda moving: change(pushed, count, results, moving))
+    pull = LinearMap(kernel(pulled), inexact, lambda: push, lambda moving: change(pulled, results, count, moving))
     return push
 
 
@@ -155,12 +156,13 @@ mlir.register_lowering(linear_p, mlir.lower_fun(_evaluate, multiple_results=True
 @at_ease
 def _jvp(primals: Arrays, tangents: Sequence[Array], *, of: LinearMap, avals: Sequence[ShapedArray]) -> Any:
     n = len(of.inexact)
-    changes = [t for t, i in zip(tangents[:n], of.inexact, strict=True) if i]
+    moving = tuple(i and not _is_zero(t) for t, i in zip(tangents[:n], of.inexact, strict=True))
     found = []
     if not all(map(_is_zero, tangents[n:])):
         found.append(of(primals[:n], _instantiated(tangents[n:]), avals))
-    if not all(map(_is_zero, changes)):
-        found.append(of.change()(primals, _instantiated(changes), avals))
+    if any(moving):
+        changes = [t for t, m in zip(tangents[:n], moving, strict=True) if m]
+        found.append(of.change(moving)(primals, changes, avals))
     return of(primals[:n], primals[n:], avals), [functools.reduce(operator.add, xs) for xs in zip(*found, strict=True)]
 
 
@@ -195,8 +197,8 @@ def _batched(of: LinearMap, at: Axes, x: Axes, y: Axes) -> LinearMap:
         found = jax.vmap(of.apply, in_axes=(at, x))(where, xs)
         return [r if d == 0 else jnp.sum(r, 0) for r, d in zip(found, y, strict=True)]
 
-    def change() -> LinearMap:
-        return _batched(of.change(), [*at, *x], [d for d, i in zip(at, of.inexact, strict=True) if i], y)
+    def change(moving: Moving) -> LinearMap:
+        return _batched(of.change(moving), [*at, *x], [d for d, m in zip(at, moving, strict=True) if m], y)
 
     return LinearMap(apply, of.inexact, lambda: _batched(of.transposed(), at, y, x), change)
 

@@ -11,16 +11,17 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from .kernel_call import as_kernel
-from .linear_map import Arrays, LinearMap, batched_alike, forward_map, is_inexact, moved
+from .linear_map import Arrays, LinearMap, Moving, batched_alike, forward_map, is_inexact, moved
 from .settings import one_kernel_enabled
 from .types import TreeDef
 
 
-PullBack = Callable[[Any, Any], list[Any]]
+PullBack = Callable[[Any, Any, Moving], list[Any]]
 
 
 def one_kernel(
@@ -37,8 +38,8 @@ def one_kernel(
     looked at afresh. `derivative` says in which mode `fn` can be differentiated: its derivative is again one kernel
     where it qualifies; with "any" it is the plain `fn` throughout.
 
-    - `pull_back(args, cotangent)`, with "reverse", gives the cotangents of those leaves of `args` that are inexact, where
-      a way is known that has forward derivatives.
+    - `pull_back(args, cotangent, moving)`, with "reverse", gives the cotangents of those leaves of `args` that are `moving`, a flag for
+      each of them, where a way is known that has forward derivatives.
     - `forward`, with "reverse": the same function, with forward derivatives of any order, where `fn` has none.
     - `way(args, result)`, with "reverse": integers that say which way the computation of derivatives goes. These get them as one more
       argument of `fn`, `forward` and `pull_back`, so that they go the same way, whatever their directions are.
@@ -65,15 +66,17 @@ def _reverse(
             out, of_ys = jax.tree.flatten(kernel(*args_of(xs)))
             return jax.tree.unflatten(of_ys, batched_alike(*out))
 
-        @solve.defjvp
-        def _(xs: Sequence[Array], dxs: Sequence[Array]) -> Any:
+        @functools.partial(solve.defjvp, symbolic_zeros=True)
+        def _(xs: Sequence[Array], dxs: Sequence[Any]) -> Any:
             out = solve(*xs)
             ys, of_ys = jax.tree.flatten(out)
             at, of_at = jax.tree.flatten(args_of(xs) if way is None else (*args_of(xs), way(args_of(xs), out)))
+            moving = [is_inexact(x) and type(dx) is not SymbolicZero for x, dx in zip(xs, dxs, strict=True)]
+            flags = *moving, *[False] * (len(at) - len(xs))
             push = _derivative(
                 fn, pull_back, forward, of_at, list(map(is_inexact, at)), of_ys, list(map(is_inexact, ys))
-            )
-            found = iter(push(at, [dx for x, dx in zip(xs, dxs, strict=True) if is_inexact(x)], inexact(ys)))
+            )(flags)
+            found = iter(push(at, [dx for dx, m in zip(dxs, moving, strict=True) if m], inexact(ys)))
             dys = [next(found) if is_inexact(y) else np.zeros(jnp.shape(y), jax.dtypes.float0) for y in ys]
             return out, jax.tree.unflatten(of_ys, dys)
 
@@ -90,62 +93,86 @@ def _derivative(
     inexact_xs: list[bool],
     of_ys: TreeDef,
     inexact_ys: list[bool],
-) -> LinearMap:
-    """dx ↦ J(x) dx, with its transpose and with the second derivative in both modes.
+) -> Callable[[Moving], LinearMap]:
+    """dx ↦ J(x) dx for those arrays in x that move, with its transpose and with the second derivative in both modes.
 
-    The second derivative is symmetric: how c·J(x) changes along u is Σₖ cₖ Hₖ u, and its transpose is itself.
+    The second derivative is symmetric: how c·J(x) changes along u is Σₖ cₖ Hₖ u; by x that moves first and then by another it is the
+    transpose of what it is the other way round.
     """
-    n, count, results = len(inexact_xs), sum(inexact_xs), sum(inexact_ys)
+    n, results = len(inexact_xs), sum(inexact_ys)
 
     def values(xs: Arrays) -> Arrays:
         return inexact(forward(*jax.tree.unflatten(of_xs, xs)))
 
-    def pushed(xs: Arrays, dxs: Arrays) -> Arrays:
-        return moved(values, xs, dxs)
+    def pushed(moving: Moving, xs: Arrays, dxs: Arrays) -> Arrays:
+        return moved(values, xs, moving, dxs)
 
-    def pulled(xs: Arrays, cotangents: Arrays) -> Arrays:
+    def pulled(moving: Moving, xs: Arrays, cotangents: Arrays) -> Arrays:
         rest = iter(cotangents)
         cotangent = jax.tree.unflatten(of_ys, [next(rest) if i else None for i in inexact_ys])
-        return (pull_back or _plain_pull_back(fn))(jax.tree.unflatten(of_xs, xs), cotangent)
+        return (pull_back or _plain_pull_back(fn))(jax.tree.unflatten(of_xs, xs), cotangent, moving)
 
-    def pulled_forwards(xs: Arrays, cotangents: Arrays) -> Arrays:
-        """The same by one forward derivative for each number in `xs`."""
-        directions, unflatten = ravel_pytree([jnp.zeros_like(x) for x in inexact(xs)])
+    def pulled_forwards(moving: Moving, xs: Arrays, cotangents: Arrays) -> Arrays:
+        """The same by one forward derivative for each number that moves."""
+        directions, unflatten = ravel_pytree([jnp.zeros_like(x) for x, m in zip(xs, moving, strict=True) if m])
 
         def slope(d: Array) -> Any:
-            return sum(jnp.sum(c * dy) for c, dy in zip(cotangents, pushed(xs, unflatten(d)), strict=True))
+            return sum(jnp.sum(c * dy) for c, dy in zip(cotangents, pushed(moving, xs, unflatten(d)), strict=True))
 
         return unflatten(jax.vmap(slope)(jnp.eye(directions.size, dtype=directions.dtype)))
 
-    def bent(at: Arrays, dxs: Arrays) -> Arrays:
+    def bent(moving: Moving, then: Moving, at: Arrays, dxs: Arrays) -> Arrays:
+        """How what is `pulled` for x that moves changes with those that move `then`."""
         differentiable = pulled if pull_back else pulled_forwards
-        return moved(lambda xs: differentiable(xs, at[n:]), at[:n], dxs)
+        return moved(lambda xs: differentiable(moving, xs, at[n:]), at[:n], then, dxs)
 
-    def pushed_apart(at: Arrays, dxs: Arrays) -> Arrays:
-        return moved(lambda xs: pushed(xs, at[n:]), at[:n], dxs)
+    def pushed_apart(moving: Moving, then: Moving, at: Arrays, dxs: Arrays) -> Arrays:
+        return moved(lambda xs: pushed(moving, xs, at[n:]), at[:n], then, dxs)
 
-    def pulled_apart(at: Arrays, cotangents: Arrays) -> Arrays:
-        return bent([*at[:n], *cotangents], at[n:])
+    def pulled_apart(moving: Moving, then: Moving, at: Arrays, cotangents: Arrays) -> Arrays:
+        return bent(then, moving, [*at[:n], *cotangents], at[n:])
 
-    of_both = [*inexact_xs, *[True] * count]
-    push = LinearMap(as_kernel(pushed), inexact_xs, lambda: pull, lambda: apart)
-    pull = LinearMap(as_kernel(pulled), inexact_xs, lambda: push, lambda: bend)
-    bend = forward_map(bent, [*inexact_xs, *[True] * results], count, lambda: bend)
-    apart = forward_map(pushed_apart, of_both, count, lambda: forward_map(pulled_apart, of_both, results))
+    def of_both(moving: Moving) -> list[bool]:
+        return [*inexact_xs, *[True] * sum(moving)]
+
+    @functools.cache
+    def push(moving: Moving) -> LinearMap:
+        return LinearMap(_kernel(pushed, moving), inexact_xs, lambda: pull(moving), lambda then: apart(moving, then))
+
+    @functools.cache
+    def pull(moving: Moving) -> LinearMap:
+        return LinearMap(_kernel(pulled, moving), inexact_xs, lambda: push(moving), lambda then: bend(moving, then))
+
+    @functools.cache
+    def bend(moving: Moving, then: Moving) -> LinearMap:
+        at = [*inexact_xs, *[True] * results]
+        return forward_map(functools.partial(bent, moving, then), at, sum(then), lambda: bend(then, moving))
+
+    @functools.cache
+    def apart(moving: Moving, then: Moving) -> LinearMap:
+        transposed = forward_map(functools.partial(pulled_apart, moving, then), of_both(moving), results)
+        return forward_map(
+            functools.partial(pushed_apart, moving, then), of_both(moving), sum(then), lambda: transposed
+        )
+
     return push
 
 
-def _plain_pull_back(fn: Callable[..., Any]) -> PullBack:
-    def pull_back(args: PyTree, cotangent: PyTree) -> list[Any]:
-        leaves, treedef = jax.tree.flatten(args)
-        exact = [not is_inexact(x) for x in leaves]
+def _kernel(fn: Callable[..., Any], moving: Moving) -> Callable[..., Any]:
+    return as_kernel(functools.partial(fn, moving))
 
-        def of_inexact(*zs: Array) -> list[Any]:
+
+def _plain_pull_back(fn: Callable[..., Any]) -> PullBack:
+    def pull_back(args: PyTree, cotangent: PyTree, moving: Moving) -> list[Any]:
+        leaves, treedef = jax.tree.flatten(args)
+
+        def of_moving(*zs: Array) -> list[Any]:
             rest = iter(zs)
-            merged = [x if e else next(rest) for e, x in zip(exact, leaves, strict=True)]
+            merged = [next(rest) if m else x for m, x in zip(moving, leaves, strict=True)]
             return inexact(fn(*jax.tree.unflatten(treedef, merged)))
 
-        return list(jax.vjp(of_inexact, *inexact(args))[1](inexact(cotangent)))
+        at = [x for m, x in zip(moving, leaves, strict=True) if m]
+        return list(jax.vjp(of_moving, *at)[1](inexact(cotangent)))
 
     return pull_back
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
@@ -112,7 +113,7 @@ def _units(problem: Problem, parameters: PyTree[Array], fixed: PyTree, end: tupl
         return each, jnp.max(by_state * size, initial=0.0), jnp.max(by_state * (1 + size), initial=0.0)
 
     try:
-        found = jax.vmap(effects)(*constant((t, state)))
+        found = lax.map(lambda at: effects(*at), constant((t, state)))
     except (TypeError, ValueError, NotImplementedError):
         # A function of the user's that has forward derivatives only.
         return jnp.ones_like(numbers, float)

@@ -13,7 +13,7 @@ from jax.core import Tracer
 from jaxtyping import PyTree
 
 from .._compat import is_captured, lacks_reverse_derivatives
-from ..compiler import PullBack, inexact, one_kernel, one_kernel_enabled, trace_state_clean, waiting
+from ..compiler import Moving, PullBack, inexact, one_kernel, one_kernel_enabled, trace_state_clean, waiting
 from ..compiler.kernel_call import as_kernel
 from ..compiler.types import Arrays
 from ..equations.independent import independent
@@ -214,7 +214,7 @@ class Solve:
             return None
         program, _ = split((self, problem))
 
-        def pull_back(inputs: tuple[Arrays], cotangent: Split) -> list[Any]:
+        def pull_back(inputs: tuple[Arrays], cotangent: Split, moving: Moving) -> list[Any]:
             with settled(program.leaves):
                 arrays, *steps = inputs
                 solve, problem = program.whole(arrays)
@@ -223,19 +223,20 @@ class Solve:
                 )
                 record, also_arrays = recording.kernel(problem)
                 _, _, ts, ys, interpolation, *_ = record(also_arrays, *steps).numbers
-                numbers, others = eqx.partition(arrays, eqx.is_inexact_array)
+                # The flags of steps come after those of the arrays.
+                numbers, others = eqx.partition(arrays, list(moving[: len(arrays)]))
                 fixed: list[Any] = []
 
                 def encoded(numbers: PyTree) -> Any:
                     solve, problem = program.whole(eqx.combine(numbers, others))
-                    found, fixed[:] = eqx.partition(solve._taped(problem), eqx.is_inexact_array)
+                    found, fixed[:] = solve._taped(problem).moving_apart(others)
                     return found
 
                 found, through_encoding = jax.vjp(encoded, numbers)
                 of_t0, of_t1, of_ts, of_ys, _, of_stats, *_ = cotangent.numbers
                 of_t1 = of_t1 + of_stats["end_time"]
                 tape = ts["tape"], ys["tape"], None if interpolation is None else interpolation.path.infos
-                of_taped = cotangents(eqx.combine(found, Taped(*fixed)), fixed_steps, tape, of_ys)
+                of_taped = cotangents(found, Taped(*fixed), fixed_steps, tape, of_ys)
                 (of_arrays,) = through_encoding(saved_times(of_taped, self.saveat.subs, of_t0, of_t1, of_ts))
                 return inexact(if_reached(of_arrays, of_bits(*steps) if steps else None))
 
@@ -253,6 +254,10 @@ class Solve:
         saveat = diffrax.SaveAt(subs=diffrax.SubSaveAt(t1=True, fn=as_it_is))
         program, _ = split((self, problem))
 
+        def changes_of(arrays: Arrays, end: Any) -> Any:
+            with settled(program.leaves):
+                return some_changes(*program.whole(arrays), end, takes_residuals(self.solver))
+
         def steps(arrays: Arrays, changes: Any, failed: BoolScalar) -> Steps:
             with settled(program.leaves):
                 solve, problem = program.whole(arrays)
@@ -263,9 +268,9 @@ class Solve:
 
         def way(args: tuple[Arrays], out: Split) -> Steps:
             (arrays,) = jax.lax.stop_gradient(args)
-            solve, problem = program.whole(arrays)
+            _, problem = program.whole(arrays)
             *_, end, _ = out.whole()
-            changes = some_changes(solve, problem, end, takes_residuals(self.solver))
+            changes = as_kernel(changes_of, often=False)(arrays, end)
             found = as_kernel(steps)(arrays, changes, failed(out, problem))
             return refused_on_the_way(found, most) if self.throw else found
 

@@ -62,7 +62,7 @@ as_it_is = lambda t, y, ode: y
 
 
 class Taped(NamedTuple):
-    """What a solve depends on, once the state is encoded; the leaves that are inexact arrays have cotangents."""
+    """What a solve depends on, once the state is encoded."""
 
     formulation: Any
     solver: Any
@@ -74,14 +74,30 @@ class Taped(NamedTuple):
     ode: Any
     view: Any
 
+    def moving_apart(self, still: PyTree[Array]) -> tuple["Taped", "Taped"]:
+        """What has cotangents and the rest, where these arrays are `still`: what is none of them, and in any case state and times."""
+        known = set(map(id, jax.tree.leaves(still)))
+        moves = lambda x: eqx.is_inexact_array(x) and id(x) not in known
+        of_equations = {"formulation", "solver", "ode", "view"}
+        flags = (
+            jax.tree.map(moves if name in of_equations else eqx.is_inexact_array, part)
+            for name, part in self._asdict().items()
+        )
+        return eqx.partition(self, Taped(*flags))
+
 
 def cotangents(
-    taped: Taped, fixed_steps: bool, tape: tuple[Float[Array, " steps"], Y, PyTree[Array]], wanted: PyTree[Array]
+    numbers: Taped,
+    rest: Taped,
+    fixed_steps: bool,
+    tape: tuple[Float[Array, " steps"], Y, PyTree[Array]],
+    wanted: PyTree[Array],
 ) -> Taped:
-    """The cotangents of the inexact arrays in `taped`.
+    """The cotangents of what moves.
 
     **Arguments**
 
+    - `numbers`, `rest`: what `Taped.moving_apart` gives.
     - `fixed_steps`: whether the first step is dt0 and the others end where they divide the interval evenly; otherwise all have
       sizes of their own but the last.
     - `tape`: times and points of the accepted steps, the start first, and for a solver that replays them what is between;
@@ -89,7 +105,7 @@ def cotangents(
     - `wanted`: the cotangents of the saved values, a leading axis of times.
     """
     times, points, between = tape
-    numbers, rest = eqx.partition(taped, eqx.is_inexact_array)
+    taped = eqx.combine(numbers, rest)
     part = taped.part
     save_times = jnp.zeros(0, times.dtype) if part.ts is None else part.ts
     first = int(part.t0)

@@ -83,7 +83,7 @@ def cubic(x, n):
 def test_of_a_kernel(order, pull_back):
     order = ORDERS[order]
 
-    def pull(args, cotangent):
+    def pull(args, cotangent, _):
         x, n = args
         return list(jax.vjp(lambda x: cubic(x, n)["y"], x)[1](cotangent["y"]))
 
