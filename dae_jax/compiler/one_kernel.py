@@ -4,8 +4,10 @@ XLA:CPU runs a loop body as a sequence of kernels and pays for each launch; for 
 4 to 12 times the arithmetic.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Literal
 
 import jax
@@ -73,9 +75,11 @@ def _reverse(
             at, of_at = jax.tree.flatten(args_of(xs) if way is None else (*args_of(xs), way(args_of(xs), out)))
             moving = [is_inexact(x) and type(dx) is not SymbolicZero for x, dx in zip(xs, dxs, strict=True)]
             flags = *moving, *[False] * (len(at) - len(xs))
-            push = _derivative(
-                fn, pull_back, forward, of_at, list(map(is_inexact, at)), of_ys, list(map(is_inexact, ys))
-            )(flags)
+            pulled = pull_back or _plain_pull_back(fn)
+            changes = _Changes(
+                pulled, bool(pull_back), forward, of_at, list(map(is_inexact, at)), of_ys, list(map(is_inexact, ys))
+            )
+            push = _derivative(changes)(flags)
             found = iter(push(at, [dx for dx, m in zip(dxs, moving, strict=True) if m], inexact(ys)))
             dys = [next(found) if is_inexact(y) else np.zeros(jnp.shape(y), jax.dtypes.float0) for y in ys]
             return out, jax.tree.unflatten(of_ys, dys)
@@ -85,81 +89,86 @@ def _reverse(
     return flat
 
 
-def _derivative(
-    fn: Callable[..., Any],
-    pull_back: PullBack | None,
-    forward: Callable[..., Any],
-    of_xs: TreeDef,
-    inexact_xs: list[bool],
-    of_ys: TreeDef,
-    inexact_ys: list[bool],
-) -> Callable[[Moving], LinearMap]:
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Changes:
+    """How the inexact results y of a function change with those arrays in x that move."""
+
+    pull_back: PullBack
+    by_pull_back: bool
+    forward: Callable[..., Any]
+    of_xs: TreeDef
+    inexact_xs: list[bool]
+    of_ys: TreeDef
+    inexact_ys: list[bool]
+
+    def pushed(self, moving: Moving, xs: Arrays, dxs: Arrays) -> Arrays:
+        """J dx."""
+        return moved(lambda xs: inexact(self.forward(*jax.tree.unflatten(self.of_xs, xs))), xs, moving, dxs)
+
+    def pulled(self, moving: Moving, xs: Arrays, cotangents: Arrays) -> Arrays:
+        """c·J."""
+        rest = iter(cotangents)
+        cotangent = jax.tree.unflatten(self.of_ys, [next(rest) if i else None for i in self.inexact_ys])
+        return self.pull_back(jax.tree.unflatten(self.of_xs, xs), cotangent, moving)
+
+    def bent(self, moving: Moving, then: Moving, at: Arrays, dxs: Arrays) -> Arrays:
+        """How c·J, at [*x, *c], changes with those that move `then`."""
+        n, differentiable = len(self.inexact_xs), self.pulled if self.by_pull_back else self._pulled_forwards
+        return moved(lambda xs: differentiable(moving, xs, at[n:]), at[:n], then, dxs)
+
+    def pushed_apart(self, moving: Moving, then: Moving, at: Arrays, dxs: Arrays) -> Arrays:
+        """How J dx, at [*x, *dx], changes with those that move `then`."""
+        n = len(self.inexact_xs)
+        return moved(lambda xs: self.pushed(moving, xs, at[n:]), at[:n], then, dxs)
+
+    def pulled_apart(self, moving: Moving, then: Moving, at: Arrays, cotangents: Arrays) -> Arrays:
+        """The transpose of that."""
+        n = len(self.inexact_xs)
+        return self.bent(then, moving, [*at[:n], *cotangents], at[n:])
+
+    def _pulled_forwards(self, moving: Moving, xs: Arrays, cotangents: Arrays) -> Arrays:
+        """c·J by one forward derivative for each number that moves."""
+        directions, unflatten = ravel_pytree([jnp.zeros_like(x) for x, m in zip(xs, moving, strict=True) if m])
+
+        def slope(d: Array) -> Any:
+            found = self.pushed(moving, xs, unflatten(d))
+            return sum(jnp.sum(c * dy) for c, dy in zip(cotangents, found, strict=True))
+
+        return unflatten(jax.vmap(slope)(jnp.eye(directions.size, dtype=directions.dtype)))
+
+
+def _derivative(of: _Changes) -> Callable[[Moving], LinearMap]:
     """dx ↦ J(x) dx for those arrays in x that move, with its transpose and with the second derivative in both modes.
 
     The second derivative is symmetric: how c·J(x) changes along u is Σₖ cₖ Hₖ u; by x that moves first and then by another it is the
     transpose of what it is the other way round.
     """
-    n, results = len(inexact_xs), sum(inexact_ys)
-
-    def values(xs: Arrays) -> Arrays:
-        return inexact(forward(*jax.tree.unflatten(of_xs, xs)))
-
-    def pushed(moving: Moving, xs: Arrays, dxs: Arrays) -> Arrays:
-        return moved(values, xs, moving, dxs)
-
-    def pulled(moving: Moving, xs: Arrays, cotangents: Arrays) -> Arrays:
-        rest = iter(cotangents)
-        cotangent = jax.tree.unflatten(of_ys, [next(rest) if i else None for i in inexact_ys])
-        return (pull_back or _plain_pull_back(fn))(jax.tree.unflatten(of_xs, xs), cotangent, moving)
-
-    def pulled_forwards(moving: Moving, xs: Arrays, cotangents: Arrays) -> Arrays:
-        """The same by one forward derivative for each number that moves."""
-        directions, unflatten = ravel_pytree([jnp.zeros_like(x) for x, m in zip(xs, moving, strict=True) if m])
-
-        def slope(d: Array) -> Any:
-            return sum(jnp.sum(c * dy) for c, dy in zip(cotangents, pushed(moving, xs, unflatten(d)), strict=True))
-
-        return unflatten(jax.vmap(slope)(jnp.eye(directions.size, dtype=directions.dtype)))
-
-    def bent(moving: Moving, then: Moving, at: Arrays, dxs: Arrays) -> Arrays:
-        """How what is `pulled` for x that moves changes with those that move `then`."""
-        differentiable = pulled if pull_back else pulled_forwards
-        return moved(lambda xs: differentiable(moving, xs, at[n:]), at[:n], then, dxs)
-
-    def pushed_apart(moving: Moving, then: Moving, at: Arrays, dxs: Arrays) -> Arrays:
-        return moved(lambda xs: pushed(moving, xs, at[n:]), at[:n], then, dxs)
-
-    def pulled_apart(moving: Moving, then: Moving, at: Arrays, cotangents: Arrays) -> Arrays:
-        return bent(then, moving, [*at[:n], *cotangents], at[n:])
-
-    def of_both(moving: Moving) -> list[bool]:
-        return [*inexact_xs, *[True] * sum(moving)]
+    xs, results = of.inexact_xs, sum(of.inexact_ys)
 
     @functools.cache
     def push(moving: Moving) -> LinearMap:
-        return LinearMap(_kernel(pushed, moving), inexact_xs, lambda: pull(moving), lambda then: apart(moving, then))
+        return LinearMap(
+            as_kernel(partial(of.pushed, moving)), xs, lambda: pull(moving), lambda then: apart(moving, then)
+        )
 
     @functools.cache
     def pull(moving: Moving) -> LinearMap:
-        return LinearMap(_kernel(pulled, moving), inexact_xs, lambda: push(moving), lambda then: bend(moving, then))
+        return LinearMap(
+            as_kernel(partial(of.pulled, moving)), xs, lambda: push(moving), lambda then: bend(moving, then)
+        )
 
     @functools.cache
     def bend(moving: Moving, then: Moving) -> LinearMap:
-        at = [*inexact_xs, *[True] * results]
-        return forward_map(functools.partial(bent, moving, then), at, sum(then), lambda: bend(then, moving))
+        at = [*xs, *[True] * results]
+        return forward_map(partial(of.bent, moving, then), at, sum(then), lambda: bend(then, moving))
 
     @functools.cache
     def apart(moving: Moving, then: Moving) -> LinearMap:
-        transposed = forward_map(functools.partial(pulled_apart, moving, then), of_both(moving), results)
-        return forward_map(
-            functools.partial(pushed_apart, moving, then), of_both(moving), sum(then), lambda: transposed
-        )
+        at = [*xs, *[True] * sum(moving)]
+        transposed = forward_map(partial(of.pulled_apart, moving, then), at, results)
+        return forward_map(partial(of.pushed_apart, moving, then), at, sum(then), lambda: transposed)
 
     return push
-
-
-def _kernel(fn: Callable[..., Any], moving: Moving) -> Callable[..., Any]:
-    return as_kernel(functools.partial(fn, moving))
 
 
 def _plain_pull_back(fn: Callable[..., Any]) -> PullBack:

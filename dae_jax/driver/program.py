@@ -256,7 +256,8 @@ class Solve:
 
         def changes_of(arrays: Arrays, end: Any) -> Any:
             with settled(program.leaves):
-                return some_changes(*program.whole(arrays), end, takes_residuals(self.solver))
+                solve, problem = program.whole(arrays)
+                return some_changes(solve, problem, end, takes_residuals(self.solver))
 
         def steps(arrays: Arrays, changes: Any, failed: BoolScalar) -> Steps:
             with settled(program.leaves):
@@ -268,7 +269,7 @@ class Solve:
 
         def way(args: tuple[Arrays], out: Split) -> Steps:
             (arrays,) = jax.lax.stop_gradient(args)
-            _, problem = program.whole(arrays)
+            problem = program.whole(arrays)[1]
             *_, end, _ = out.whole()
             changes = as_kernel(changes_of, often=False)(arrays, end)
             found = as_kernel(steps)(arrays, changes, failed(out, problem))

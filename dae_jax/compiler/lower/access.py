@@ -6,7 +6,8 @@ import numpy as np
 
 from .arrays import Buffer
 from .dtypes import BYTES
-from .instructions import Complex, Index, Instructions, Number, Value, parts
+from .instructions import Instructions
+from .values import Complex, Index, Number, Run, Value, parts
 
 
 def load(code: Instructions, buffer: Buffer, place: Index) -> Any:
@@ -31,8 +32,8 @@ def address_of(code: Instructions, buffer: Buffer, place: Index) -> str:
         return buffer.pointer
     assert not buffer.apart
     place = code.times(place, 2) if buffer.parts == 2 and not buffer.plane else place
-    address, each = _address(code, buffer, place)
-    assert not each
+    address, lanes = _address(code, buffer, place)
+    assert not lanes
     return address
 
 
@@ -45,8 +46,10 @@ def _stored(buffer: Buffer) -> str:
     return "i8" if buffer.kind == "i1" else buffer.kind
 
 
-def _address(code: Instructions, buffer: Buffer, place: Index) -> tuple[str, bool]:
-    """The address of a number, or a vector of addresses (and whether it is one)."""
+def _address(code: Instructions, buffer: Buffer, place: Index) -> tuple[str, str]:
+    """The address of a number; or of the first where the lanes' numbers follow one another ("run"); or a vector of addresses ("each")."""
+    if isinstance(place, Run) and not buffer.lanes:
+        return _address(code, buffer, place.base)[0], "run"
     each = isinstance(place, Value) and place.lanes
     if buffer.apart:
         place = code.times(place, Value("%threads", "i64"))
@@ -57,7 +60,7 @@ def _address(code: Instructions, buffer: Buffer, place: Index) -> tuple[str, boo
             place = code.pure(f"add {code.type('i64', True)} {place.name}, <{lane}>", "i64", True)
     index = code.operand(place, "i64", each)
     out = code.pure(f"getelementptr {_stored(buffer)}, ptr {buffer.pointer}, {index}", "ptr", each)
-    return out.name, each
+    return out.name, "each" if each else ""
 
 
 def _active(code: Instructions) -> str:
@@ -67,9 +70,9 @@ def _active(code: Instructions) -> str:
 
 def _loaded(code: Instructions, buffer: Buffer, place: Index) -> Value:
     stored = _stored(buffer)
-    address, each = _address(code, buffer, place)
-    vector = code.type(stored, each or buffer.lanes)
-    if each:
+    address, lanes = _address(code, buffer, place)
+    vector = code.type(stored, bool(lanes) or buffer.lanes)
+    if lanes == "each":
         full = f"llvm.masked.gather.v{code.width}{_suffix(stored)}.v{code.width}p0"
         pointers = code.type("ptr", True)
         function = code.function(full, vector, pointers, code.type("i1", True), vector)
@@ -77,7 +80,7 @@ def _loaded(code: Instructions, buffer: Buffer, place: Index) -> Value:
         text = f"call {vector} {function}({aligned}, {_active(code)}, {vector} zeroinitializer)"
     else:
         text = f"load {vector}, ptr {address}, align {BYTES[stored]}"
-    x = code.write(text, stored, each or buffer.lanes)
+    x = code.write(text, stored, bool(lanes) or buffer.lanes)
     return code.cast("trunc", x, "i1") if buffer.kind == "i1" else x
 
 
@@ -85,8 +88,8 @@ def _store(code: Instructions, buffer: Buffer, place: Index, x: Number) -> None:
     stored = _stored(buffer)
     if buffer.kind == "i1":
         x = code.cast("zext", x, "i8") if isinstance(x, Value) else np.int8(bool(x))
-    address, each = _address(code, buffer, place)
-    number = code.operand(x, stored, buffer.lanes or each)
+    address, lanes = _address(code, buffer, place)
+    number, each = code.operand(x, stored, buffer.lanes or bool(lanes)), lanes == "each"
     if not each and code.mask is None:
         code.lines.append(f"store {number}, ptr {address}, align {BYTES[stored]}")
         return

@@ -11,7 +11,8 @@ from ..jaxprs.objects import is_number
 from . import complex_arithmetic
 from .dtypes import BYTES, is_signed, kind_of, part
 from .extrema import absolute, extremum
-from .instructions import Complex, Instructions, Number, Value, parts
+from .instructions import Instructions
+from .values import Complex, Number, Value, parts
 
 
 _OF_FLOATS = {"add": "fadd contract", "sub": "fsub contract", "mul": "fmul contract", "div": "fdiv"}

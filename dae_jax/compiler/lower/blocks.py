@@ -7,7 +7,12 @@ from typing import Any
 import numpy as np
 
 from ..thresholds import THRESHOLDS
-from .instructions import Index, Instructions, Number, Value
+from .instructions import Instructions
+from .values import Index, Number, Run, Value
+
+
+# Entries of arrays that are worked out at once.
+VECTORS = (8, 4)
 
 
 @contextlib.contextmanager
@@ -44,6 +49,28 @@ def for_each(
         index = [0 if n == 1 else stack.enter_context(loop(code, n)) for n in shape[:outer]]
         for inner in np.ndindex(*shape[outer:]):
             action([*index, *inner])
+
+
+def for_each_in_vectors(code: Instructions, shape: Sequence[int], action: Callable[[list[Index]], None]) -> None:
+    """The same for several of the last index at once, as lanes, where that has as many entries as a vector; the last of them may be done
+    twice.
+    """
+    *outer, count = shape
+    width = next(w for w in VECTORS if w <= count)
+
+    def row(index: list[Index]) -> None:
+        with contextlib.ExitStack() as stack:
+            turns = -(-count // width)
+            stack.enter_context(code.scope())
+            base = 0 if turns == 1 else code.times(stack.enter_context(loop(code, turns)), width)
+            if count % width and turns > 1:
+                base = code.intrinsic("smin", "i64", base, count - width)
+            code.longest = max(code.longest, count)
+            code.width = width
+            action([*index, Run(code, base)])
+            code.width = 1
+
+    for_each(code, outer, row, few=1)
 
 
 def accumulated(

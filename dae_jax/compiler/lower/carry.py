@@ -7,9 +7,10 @@ from ..thresholds import THRESHOLDS
 from ..types import Aval
 from .arrays import Operand, View
 from .dtypes import kinds_of
-from .instructions import Instructions, Value
+from .instructions import Instructions
 from .memory import Memory
 from .operands import of_texts, retain, texts
+from .values import Value
 
 
 class Carry:

@@ -2,7 +2,8 @@
 
 from typing import Any
 
-from .instructions import Complex, Instructions, Number, parts
+from .instructions import Instructions
+from .values import Complex, Number, parts
 
 
 def negative(code: Instructions, kind: str, x: Number) -> Complex:

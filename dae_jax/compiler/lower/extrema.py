@@ -4,7 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from .instructions import Instructions, Value
+from .instructions import Instructions
+from .values import Value
 
 
 def absolute(code: Instructions, kind: str, x: Any) -> Value:

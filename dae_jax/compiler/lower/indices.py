@@ -10,7 +10,8 @@ from ..jaxprs.objects import is_number
 from .arithmetic import convert
 from .arrays import Operand, View
 from .context import Context
-from .instructions import Index, Instructions, Value
+from .instructions import Instructions
+from .values import Index, Value
 
 
 Read = Callable[[Sequence[Any]], Any]

@@ -5,37 +5,15 @@ that holds one number of each lane, or a single number that is the same for all.
 """
 
 import contextlib
-import dataclasses
 import struct
 from collections.abc import Callable, Hashable, Iterable, Iterator
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
 from ..emit.target import Target, vector_size
 from ..emit.vector_math import vector_function
-
-
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class Value:
-    """The result of an instruction: its name, the LLVM type of one number, and whether each lane has its own."""
-
-    name: str
-    kind: str
-    lanes: bool = False
-
-
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class Complex:
-    """A complex number in two."""
-
-    real: Any
-    imag: Any
-
-
-# A number: the result of an instruction, or known. An index: the same of an integer of 64 bits.
-Number: TypeAlias = Value | Complex | np.number | np.bool_ | float
-Index: TypeAlias = Value | int
+from .values import Complex, Index, Number, Run, Value, parts
 
 
 class Instructions:
@@ -278,7 +256,12 @@ class Instructions:
             return a + b
         if isinstance(a, int) and a == 0:
             return b
-        return a if isinstance(b, int) and b == 0 else self.op("add", "i64", a, b)
+        if isinstance(b, int) and b == 0:
+            return a
+        for run, by in ((a, b), (b, a)):
+            if isinstance(run, Run) and not (isinstance(by, Value) and by.lanes):
+                return Run(self, self.plus(run.base, by))
+        return self.op("add", "i64", a, b)
 
     def copy(self, x: Number, kind: str) -> Value:
         """A value in any case."""
@@ -288,12 +271,3 @@ class Instructions:
         """A number as one of another type; `joined`: the bits of all lanes as one number."""
         to = self.type(kind, x.lanes and not joined)
         return self.pure(f"{code} {self.type(x.kind, x.lanes)} {x.name} to {to}", kind, x.lanes and not joined)
-
-
-def parts(x: Number) -> tuple[Any, Any]:
-    """The real and the imaginary part of a number."""
-    if isinstance(x, Complex):
-        return x.real, x.imag
-    if isinstance(x, np.complexfloating):
-        return np.float64(x.real), np.float64(x.imag)
-    return x, np.float64(0)

@@ -20,10 +20,10 @@ from .arrays import Operand, View
 from .carry import kept_apart
 from .dtypes import kinds_of
 from .environment import Environment
-from .instructions import Complex, Number, Value
 from .lowering import Lowering
 from .operands import has_lanes, of_texts, retain, texts
 from .uniformity import varying_in_loop
+from .values import Complex, Number, Value
 
 
 class NotQueued(Exception):

@@ -13,9 +13,10 @@ from ..thresholds import THRESHOLDS
 from ..types import DType
 from .access import load, store
 from .arrays import Buffer, Fused, Operand, View, row_major
-from .blocks import for_each
+from .blocks import VECTORS, for_each, for_each_in_vectors
 from .dtypes import BYTES, parts_of
-from .instructions import Index, Instructions, Number
+from .instructions import Instructions
+from .values import Index, Number
 
 
 # A byte as LLVM has it in a string, which it reads faster than numbers one by one.
@@ -189,10 +190,22 @@ class Memory:
             x = self.view(x, to.dtype)
         flat = self.flat(x) if to.contiguous and len(to.shape) > 1 else None
         if flat:
-            for_each(self.code, [to.size], lambda i: put(self.code.plus(to.offset, i[0]), flat(i[0])))
+            shape, few = (to.size,), THRESHOLDS.per_turn
+            one = lambda index: put(self.code.plus(to.offset, index[0]), flat(index[0]))
         else:
-            few = x.size if isinstance(x, np.ndarray) else THRESHOLDS.per_turn
-            for_each(self.code, x.shape, lambda index: put(self.at(to, index), self.entry(x, index)), few)
+            shape, few = x.shape, x.size if isinstance(x, np.ndarray) else THRESHOLDS.per_turn
+            one = lambda index: put(self.at(to, index), self.entry(x, index))
+        if self._in_vectors(to, x, shape):
+            for_each_in_vectors(self.code, shape, one)
+        else:
+            for_each(self.code, shape, one, few)
+
+    def _in_vectors(self, to: View, x: Operand, shape: Sequence[int]) -> bool:
+        """Whether entries that follow one another may be computed at once, and the last of them twice."""
+        follow_one_another = bool(shape) and shape[-1] >= VECTORS[-1] and to.strides[-1] == 1
+        apart = not isinstance(x, np.ndarray) and to.buffer not in x.buffers
+        threads = self.code.target is not None and self.code.target.threads
+        return self.code.width == 1 and follow_one_another and apart and not threads and to.buffer.parts == 1
 
 
 def _without_repeats(x: np.ndarray) -> np.ndarray:

@@ -7,9 +7,9 @@ from ..thresholds import THRESHOLDS
 from ..types import Aval
 from .arrays import Buffer, Operand, View
 from .dtypes import kinds_of
-from .instructions import Value
 from .memory import Memory
 from .operands import has_lanes, of_texts, texts
+from .values import Value
 
 
 def hold(xs: Sequence[Operand]) -> list[Buffer]:

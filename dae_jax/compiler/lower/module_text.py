@@ -16,9 +16,9 @@ from .access import store
 from .annotated import Annotated
 from .arrays import Buffer, Operand, View, row_major
 from .dtypes import parts_of
-from .instructions import Value
 from .lane_queue import LaneQueue, NotQueued, main_loop
 from .lowering import Lowering, TooLarge
+from .values import Value
 
 
 # Of the loops that LLVM shall not make ones of vectors.

@@ -6,7 +6,8 @@ from ..jaxprs.objects import objects
 from ..types import Aval
 from .arrays import Operand, View
 from .dtypes import kinds_of
-from .instructions import Complex, Instructions, Value, parts
+from .instructions import Instructions
+from .values import Complex, Value, parts
 
 
 def texts(code: Instructions, aval: Aval, x: np.ndarray, lanes: bool) -> list[str]:

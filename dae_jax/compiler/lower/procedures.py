@@ -21,8 +21,8 @@ from ..types import Aval
 from .access import address_of, store
 from .arrays import Buffer, Operand, View, row_major
 from .dtypes import kinds_of, parts_of
-from .instructions import Value
 from .operands import has_lanes, of_texts, texts
+from .values import Value
 
 
 if TYPE_CHECKING:

@@ -9,7 +9,8 @@ from ..arithmetic import compared
 from ..context import Context
 from ..dtypes import BYTES, FLOATS, INTEGERS, REALS, kind_of
 from ..entrywise import entrywise
-from ..instructions import Instructions, Number, Value
+from ..instructions import Instructions
+from ..values import Number, Value
 
 
 def _bits(code: Instructions, x: Number, kind: str) -> Value:

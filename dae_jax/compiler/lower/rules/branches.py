@@ -12,9 +12,9 @@ from ..arithmetic import compared
 from ..arrays import Operand
 from ..context import Context
 from ..dtypes import ALL, BOOL, INTEGERS
-from ..instructions import Value
 from ..merged import Merged, hold
 from ..registry import free, rule
+from ..values import Value
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,8 +14,8 @@ from ..arithmetic import combined, convert, total
 from ..arrays import Operand, View
 from ..context import Context
 from ..dtypes import NUMBERS
-from ..instructions import Index
 from ..registry import rule
+from ..values import Index
 from .reductions import folded, in_pairs
 
 

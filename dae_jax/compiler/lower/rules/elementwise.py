@@ -8,7 +8,7 @@ from ..arithmetic import applied, compared, convert, power, total
 from ..context import Context
 from ..dtypes import ALL, BOOL, COMPLEX, FLOATS, INTEGERS, NUMBERS, REALS, is_signed, kind_of, part
 from ..entrywise import entrywise
-from ..instructions import Complex, Number, Value, parts
+from ..values import Complex, Number, Value, parts
 
 
 def _of_its_type(eqn: Equation) -> str | None:

@@ -11,7 +11,8 @@ from ..arithmetic import convert
 from ..context import Context
 from ..dtypes import BYTES, FLOATS, INTEGERS, kind_of
 from ..entrywise import entrywise
-from ..instructions import Instructions, Number, Value
+from ..instructions import Instructions
+from ..values import Number, Value
 
 
 _INTRINSICS = {"sqrt": "sqrt", "floor": "floor", "ceil": "ceil"}

@@ -16,8 +16,8 @@ from ..blocks import for_each
 from ..context import Context
 from ..dtypes import ALL, BOOL, INTEGERS, NUMBERS, REALS
 from ..indices import indices_of, offsets_of, window_start
-from ..instructions import Index, Number, Value
 from ..registry import rule
+from ..values import Index, Number, Value
 
 
 @rule("dynamic_slice", (ALL, INTEGERS), by_memory=True)

@@ -5,7 +5,7 @@ from typing import Any
 from ..context import Context
 from ..dtypes import BOOL, BYTES, INTEGERS, kind_of
 from ..entrywise import entrywise
-from ..instructions import Number, Value
+from ..values import Number, Value
 
 
 _SHIFTS = {"shift_left": "shl", "shift_right_logical": "lshr"}

@@ -16,10 +16,10 @@ from ..carry import Carry
 from ..context import Context
 from ..dtypes import ALL
 from ..estimate import is_written_out
-from ..instructions import Value
 from ..operands import has_lanes, retain
 from ..registry import free, rule
 from ..uniformity import varying_in_loop, varying_in_scan
+from ..values import Value
 
 
 @contextlib.contextmanager

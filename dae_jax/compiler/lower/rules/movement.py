@@ -12,8 +12,8 @@ from ..arithmetic import convert
 from ..arrays import Fused, Operand, View, row_major
 from ..context import Context
 from ..dtypes import ALL, REALS
-from ..instructions import Index
 from ..registry import free, rule
+from ..values import Index
 
 
 def movement(

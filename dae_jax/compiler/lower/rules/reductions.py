@@ -17,8 +17,8 @@ from ..arrays import Fused, Operand, View
 from ..blocks import accumulated, for_each
 from ..context import Context
 from ..dtypes import BOOL, FLOATS, INTEGERS, NUMBERS, REALS, kind_of, parts_of
-from ..instructions import Complex, Index, Number, parts
 from ..registry import rule
+from ..values import Complex, Index, Number, parts
 
 
 _FOLDS = {

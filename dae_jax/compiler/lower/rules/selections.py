@@ -7,7 +7,7 @@ from ..arithmetic import compared
 from ..context import Context
 from ..dtypes import ALL, BOOL, INTEGERS, kind_of, part
 from ..entrywise import entrywise
-from ..instructions import Number
+from ..values import Number
 
 
 @entrywise("select_n", (BOOL | INTEGERS, ALL), moves=True)
