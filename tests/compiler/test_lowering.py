@@ -421,3 +421,32 @@ def test_the_next_number_is_that_of_numpy(dtype):
     np.testing.assert_array_equal(np.isnan(found), np.isnan(expected))
     number, bits = ~np.isnan(expected), f"i{dtype().nbytes}"
     np.testing.assert_array_equal(found[number].view(bits), expected[number].view(bits))
+
+
+def of_rows(x, table):
+    """What is read in order, along columns, from the end, at computed places, through a table, across a seam; sums over each axis."""
+    rows, n = jnp.sin(x) * x[:, ::-1], x.shape[1]
+    places = (jnp.abs(x[0]) * 7).astype(int) % n
+    return [
+        rows, rows.T * 2, rows @ rows.T, rows.T @ rows, rows[:, places] + table, jnp.cumsum(rows, 1), jnp.sum(rows, 0), jnp.sum(rows, 1),
+        jnp.concatenate([rows + 1, table[:, :2] * x[:, :2]], 1) * 3, jnp.pad(rows - 1, ((0, 1), (2, 1))) / 2, rows > table,
+        jnp.arange(n) * x[1], (10 * rows).astype(jnp.int32) // 3, jnp.where(rows > 0, table, rows), jnp.max(rows, 1), jnp.argmax(rows, 1),
+        rows.at[1].add(table[0]), rows.at[:, places].set(table), jnp.float32(rows) * 3,
+        jax.lax.fori_loop(0, 3, lambda i, y: y * 0.5 + rows, table),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("n", [9, 11, 12, 15, 16, 23])
+def test_loops_over_arrays_are_of_vectors(n):
+    """Also of lengths that vectors do not divide: the last one is done again in part."""
+    rng = np.random.default_rng(n)
+    x, table = rng.normal(size=(3, n)), rng.normal(size=(3, n))
+    expected = jax.jit(of_rows)(x, table)
+    for found in (one_kernel(of_rows, "forward")(x, table), jax.tree.map(lambda y: y[1], jax.vmap(
+        one_kernel(of_rows, "forward"), in_axes=(0, None))(np.stack([0 * x, x]), table))):  # fmt: skip
+        for a, b in zip(found, expected, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-6 if a.dtype == np.float32 else 1e-13, atol=1e-14)
+    text = written(jax.make_jaxpr(lambda x, table: jnp.sin(table) * x + 1)(x, table))
+    assert "load <8 x double>" in text
+    assert "store <8 x double>" in text
+    assert "gather" not in text

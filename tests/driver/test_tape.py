@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import dae_jax
+from dae_jax.compiler import equations
 from dae_jax.driver.trajectory_adjoint import LARGEST_OF_LARGE, can_be_taped
 from dae_jax.scenes import chain, pendulum
 
@@ -141,3 +142,26 @@ def test_of_an_interval_without_length(name, saved):
     np.testing.assert_allclose(of_angle, rows * (rows + 1) / 2 * (np.cos(0.3) - np.sin(0.3)), rtol=1e-13)
     for found in of_times:
         np.testing.assert_array_equal(found, 0)
+
+
+def test_what_stays_has_no_cotangent():
+    """Of all numbers of a solve only those that move: the velocity at the start, or the end of the interval."""
+
+    def length(gravity, t1=1.0):
+        sol = dae_jax.daesolve(
+            SCENE.system,
+            SOLVERS["projection"],
+            0.0,
+            t1,
+            None,
+            (jnp.array([1.0, 0.0]), jnp.zeros(2) + gravity),
+            args=jnp.arange(9.0),
+        )
+        return sol.ys[0][-1, 1]
+
+    def cotangents_of(fn):
+        maps = [eqn for eqn in equations(jax.make_jaxpr(jax.grad(fn))(0.3)) if eqn.primitive.name == "linear_map"]
+        return [[v.aval.shape for v in eqn.outvars] for eqn in maps]
+
+    assert cotangents_of(length) == [[(2,)]]
+    assert cotangents_of(lambda t1: length(0.1, t1)) == [[()]]
