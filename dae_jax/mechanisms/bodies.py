@@ -145,6 +145,8 @@ def dimension(q: Float[Array, " k"]) -> int:
     return 2 if len(q) == 3 else 3
 
 
+# Where the bodies of a mechanism are asked for one by one, it would be compiled operation by operation.
+@functools.partial(jax.jit, inline=True)
 def velocities(q: Float[Array, " k"], velocity: Float[Array, " d"], spin: Float[Array, "..."]) -> Float[Array, " k"]:
     """v at q for a velocity of the centre of mass and an angular velocity in world axes."""
     if dimension(q) == 2:
@@ -153,7 +155,6 @@ def velocities(q: Float[Array, " k"], velocity: Float[Array, " d"], spin: Float[
     return jnp.concatenate([velocity, rotate_back(rates(e), rotate_back(matrix(e), spin)) / 2])
 
 
-# Where the bodies of a mechanism are asked for one by one, it would be compiled operation by operation.
 @functools.partial(jax.jit, inline=True)
 def pose(q: Float[Array, " k"]) -> Pose:
     """Where a body is at q."""

@@ -1,7 +1,9 @@
 """Where a joint is on its two bodies: markers from points and axes in the world, or from points of the bodies."""
 
+import functools
 from typing import Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -112,11 +114,16 @@ def _vector(label: str, what: str, value: Numbers, d: int) -> Float[Array, " d"]
 
 def unit(label: str, axis: Numbers, d: int) -> Float[Array, " d"]:
     """The direction of an axis, which must have one."""
-    vector = _vector(label, "axis", axis, d)
-    length = jnp.sqrt(jnp.sum(vector**2))
+    length, direction = _polar(_vector(label, "axis", axis, d))
     if not isinstance(length, Tracer) and not (np.isfinite(length) and length > 0):
         raise ValueError(f"Joint {label!r} has an axis of length {float(length):g}, which has no direction.")
-    return vector / length
+    return direction
+
+
+@functools.partial(jax.jit, inline=True)
+def _polar(vector: Float[Array, " d"]) -> tuple[Float[Array, ""], Float[Array, " d"]]:
+    length = jnp.sqrt(jnp.sum(vector**2))
+    return length, vector / length
 
 
 def frame_along(axis: Float[Array, " d"]) -> Float[Array, "d d"]:
