@@ -14,6 +14,8 @@ class Thresholds:
     - `in_registers`: entries up to which an operation on registers writes out its result entry by entry; what is larger is a loop.
     - `folded`: entries up to which what a constant gives is worked out while compiling; larger ones are data of the module.
     - `per_turn`: entries that the body of a loop over an array has written out at most. More gain nothing, and take longer to compile.
+    - `vectors`: entries that a loop over an array works out at once, the most that there are; fewer are done one by one. LLVM's passes
+      make such loops too, where they run: in a kernel that is too long for them a linkage in space takes half the time.
     - `stack_bytes`: bytes of a buffer that the stack holds; larger ones are taken from the heap, all at once.
     - `heap_bytes`: bytes of memory that a function may take for its arrays, all lanes of a vector together.
     - `thread_bytes`: bytes of a buffer that a thread on a GPU has of its own, since the device keeps as much for each that may run;
@@ -59,6 +61,7 @@ class Thresholds:
     in_registers: int = 512
     folded: int = 4096
     per_turn: int = 4
+    vectors: tuple[int, ...] = (8, 4)
     stack_bytes: int = 1024
     heap_bytes: int = 2**30
     thread_bytes: int = 2**12

@@ -11,10 +11,6 @@ from .instructions import Instructions
 from .values import Index, Number, Run, Value
 
 
-# Entries of arrays that are worked out at once.
-VECTORS = (8, 4)
-
-
 @contextlib.contextmanager
 def loop(code: Instructions, count: Index, phis: list[str] | None = None) -> Iterator[Value]:
     """Runs what is written inside for an index from 0 to `count`; `phis` are other variables of the loop."""
@@ -56,7 +52,7 @@ def for_each_in_vectors(code: Instructions, shape: Sequence[int], action: Callab
     twice.
     """
     *outer, count = shape
-    width = next(w for w in VECTORS if w <= count)
+    width = next(w for w in THRESHOLDS.vectors if w <= count)
 
     def row(index: list[Index]) -> None:
         with contextlib.ExitStack() as stack:

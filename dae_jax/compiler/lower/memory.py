@@ -13,7 +13,7 @@ from ..thresholds import THRESHOLDS
 from ..types import DType
 from .access import load, store
 from .arrays import Buffer, Fused, Operand, View, row_major
-from .blocks import VECTORS, for_each, for_each_in_vectors
+from .blocks import for_each, for_each_in_vectors
 from .dtypes import BYTES, parts_of
 from .instructions import Instructions
 from .values import Index, Number
@@ -202,7 +202,7 @@ class Memory:
 
     def _in_vectors(self, to: View, x: Operand, shape: Sequence[int]) -> bool:
         """Whether entries that follow one another may be computed at once, and the last of them twice."""
-        follow_one_another = bool(shape) and shape[-1] >= VECTORS[-1] and to.strides[-1] == 1
+        follow_one_another = bool(shape) and shape[-1] >= THRESHOLDS.vectors[-1] and to.strides[-1] == 1
         apart = not isinstance(x, np.ndarray) and to.buffer not in x.buffers
         threads = self.code.target is not None and self.code.target.threads
         return self.code.width == 1 and follow_one_another and apart and not threads and to.buffer.parts == 1
