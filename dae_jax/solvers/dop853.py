@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from ..types import Args, BoolLike, Time, Y
+from ..types import Args, BoolLike, Scalar, Time, Y
 from . import dop853_coefficients as coefficients
 from .explicit import Flat, advanced, combine, first_derivative, identity, stage_slopes, with_retraction
 
@@ -88,8 +88,9 @@ class DOP853(diffrax.AbstractAdaptiveSolver):
         state: Y,
         made_jump: BoolLike,
         retract: Callable[..., tuple[Y, BoolLike]],
+        excused: Scalar | float = 0.0,
     ) -> Any:
-        """`step`, with its end moved to `retract(t1, y1)` → (y1, found)."""
+        """`step`, with its end moved to `retract(t1, y1)` → (y1, found); see `with_retraction`."""
         h = terms.contr(t0, t1)
         flat = Flat(terms, t0, y0, args, retract)
         f0 = first_derivative(flat, t0, state, made_jump)
@@ -101,7 +102,7 @@ class DOP853(diffrax.AbstractAdaptiveSolver):
         f1 = flat.field(t1, y1)
         fs.append(f1)
         error = h * _error(combine(coefficients.E5, fs), slope - combine(_B_MINUS_E3, fs), flat.y0, y1)
-        error = with_retraction(error, ahead, y1)
+        error = with_retraction(error, ahead, y1, excused)
         rest = self._interpolant(flat, t0, t1, h, y1, fs) if self.dense else [y1 - flat.y0]
         dense = {"y0": y0, "f": jax.tree.map(lambda *f: jnp.stack(f), *map(flat.tree, rest))}
         return flat.tree(y1), flat.tree(error), dense, flat.tree(f1), found

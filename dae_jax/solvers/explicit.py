@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from ..compiler import is_large, scalarise, subroutine
-from ..types import BoolLike, Time
+from ..types import BoolLike, Scalar, Time
 from .wrapping import AbstractWrapper
 
 
@@ -152,8 +152,9 @@ class Unrolled(AbstractWrapper):
         state: Any,
         made_jump: BoolLike,
         retract: Callable[..., Any],
+        excused: Scalar | float = 0.0,
     ) -> Any:
-        """`step`, with its end moved to `retract(t1, y1)` → (y1, found)."""
+        """`step`, with its end moved to `retract(t1, y1)` → (y1, found); see `with_retraction`."""
         tableau = self.tableau
         h = terms.contr(t0, t1)
         flat = Flat(terms, t0, y0, args, retract)
@@ -171,20 +172,19 @@ class Unrolled(AbstractWrapper):
             ahead = flat.y0 + h * combine(tableau.b_sol, fs)
             y1, found = flat.retract(t1, ahead)
         estimates = np.any(tableau.b_error)
-        error = flat.tree(with_retraction(h * combine(tableau.b_error, fs), ahead, y1)) if estimates else None
+        error = flat.tree(with_retraction(h * combine(tableau.b_error, fs), ahead, y1, excused)) if estimates else None
         dense = {"y0": y0, "y1": flat.tree(y1), "k": jax.tree.map(lambda *f: h * jnp.stack(f), *map(flat.tree, fs))}
         return flat.tree(y1), error, dense, None if f1 is None else flat.tree(f1), found
 
 
-def with_retraction(error: Array, ahead: Array, retracted: Array) -> Array:
-    """The error, and where it is more how far the end was moved: a manifold that jumps does not show in the stages. What
-    the user's start may be off by does not count.
+def with_retraction(error: Array, ahead: Array, retracted: Array, excused: Scalar | float) -> Array:
+    """The error, and where it is more how far the end was moved: a manifold that jumps does not show in the stages, nor does that
+    the way back is long, as it is for a variable of another unit. Less than `excused` does not count.
     """
     if retracted is ahead:
         return error
     moved = retracted - ahead
-    allowed = 2 * float(jnp.finfo(moved.dtype).eps) ** 0.5 * (1 + jnp.max(jnp.abs(retracted)))
-    return jnp.where(jnp.abs(moved) > jnp.maximum(jnp.abs(error), allowed), moved, error)
+    return jnp.where(jnp.abs(moved) > jnp.maximum(jnp.abs(error), excused), moved, error)
 
 
 def first_derivative(flat: Flat, t0: Time, state: Any, made_jump: BoolLike) -> Any:

@@ -1,6 +1,7 @@
 """Orthogonal projection after each step (Pöll, Hafner and Heinzl, sec. 2.4)."""
 
-from typing import Any
+import functools
+from typing import Any, NamedTuple
 
 import diffrax
 import jax
@@ -13,6 +14,15 @@ from .explicit import unrolled, with_retraction
 from .manifold import AbstractManifoldSolver, or_nan, outcome, time_sign
 from .residual_steps import AbstractResidualSolver
 from .wrapping import AbstractWrapper
+
+
+class Projected(NamedTuple):
+    """What a step leaves to the next: the inner solver's state, and how far its start may be off the manifold: what a user's may,
+    after a step nothing.
+    """
+
+    inner: Any
+    excused: Any
 
 
 class OrthogonalProjection(AbstractWrapper, AbstractManifoldSolver):
@@ -50,7 +60,9 @@ class OrthogonalProjection(AbstractWrapper, AbstractManifoldSolver):
         return is_recomputable(self.solver)
 
     def init(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any) -> Any:
-        return unrolled(self.solver).init(terms, t0, t1, y0, args)
+        eps = max(float(jnp.finfo(x.dtype).eps) for x in jax.tree.leaves(y0))
+        largest = jnp.max(jnp.stack([jnp.max(jnp.abs(x), initial=0) for x in jax.tree.leaves(y0)]))
+        return Projected(unrolled(self.solver).init(terms, t0, t1, y0, args), 2 * eps**0.5 * (1 + largest))
 
     def step(
         self,
@@ -59,7 +71,7 @@ class OrthogonalProjection(AbstractWrapper, AbstractManifoldSolver):
         t1: Time,
         y0: Any,
         args: Any,
-        solver_state: Any,
+        solver_state: Projected,
         made_jump: BoolLike,
     ) -> Any:
         solver: Any = unrolled(self.solver)
@@ -69,16 +81,19 @@ class OrthogonalProjection(AbstractWrapper, AbstractManifoldSolver):
             return args.project(sign * t, y)
 
         if hasattr(solver, "step_and_retract"):
-            y1, error, dense, state, found = solver.step_and_retract(
-                terms, t0, t1, y0, args, solver_state, made_jump, retract
+            y1, error, dense, inner, found = solver.step_and_retract(
+                terms, t0, t1, y0, args, solver_state.inner, made_jump, retract, solver_state.excused
             )
             result = diffrax.RESULTS.successful
         else:
-            ahead, error, dense, state, result = solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
+            ahead, error, dense, inner, result = solver.step(terms, t0, t1, y0, args, solver_state.inner, made_jump)
             y1, found = retract(t1, ahead)
-            error = None if error is None else jax.tree.map(with_retraction, error, ahead, y1)
+            if error is not None:
+                counted = functools.partial(with_retraction, excused=solver_state.excused)
+                error = jax.tree.map(counted, error, ahead, y1)
         error = None if error is None else or_nan(found, error)
         result = diffrax.RESULTS.where(result == diffrax.RESULTS.successful, outcome(jnp.asarray(found)), result)
+        state = Projected(inner, jnp.zeros_like(solver_state.excused))
         return or_nan(found, y1), error, dense, state, result
 
     def retract(self, t: Any, y: Any, ode: Any) -> Any:

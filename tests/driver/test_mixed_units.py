@@ -3,7 +3,9 @@
 import diffrax
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import dae_jax
 from dae_jax import AccuracyWarning, ConstrainedSystem, ImplicitDAE, OrthogonalProjection
@@ -79,3 +81,32 @@ def test_what_a_solve_ends_with_is_a_start_at_zeros_too(solver, amplitude):
     sol = dae_jax.daesolve(system, solver, 0.0, 9.0, None, start, saveat=diffrax.SaveAt(ts=ends))
     again = lambda t, y: dae_jax.daesolve(system, solver, t, t + 1e-3, None, y, throw=False).result._value
     assert not jnp.any(jax.vmap(again)(ends, sol.ys))
+
+
+MIXED = jnp.array([1e-3, 1e3, 1e-6, 1e4, 1.0])
+
+
+def off_of_a_pendulum(solver, tolerance, **options):
+    """One that goes round, x in millimetres, y in kilometres, their rates in μm/s and 10 km/s: near y = 0 a bit of x is much of y. How far
+    it is off at the end, and whether that was reached.
+    """
+
+    def residual(t, state, rates, args):
+        (x, y, u, v, pull), (xd, yd, ud, vd, _) = state * MIXED, rates * MIXED
+        return jnp.stack([xd - u, yd - v, ud + pull * x, vd + pull * y - 9.81, (x**2 + y**2 - 1) / 2])
+
+    start = jnp.array([0.0, 1.0, 8.0, 0.0, 73.81]) / MIXED
+    controller = diffrax.PIDController(rtol=tolerance, atol=tolerance * 1e-4)
+    system, options = ImplicitDAE(residual), {**options, "stepsize_controller": controller, "throw": False}
+    sol = dae_jax.daesolve(system, solver, 0.0, 2.0, None, start, **options)
+    swing = lambda t, s: (s[1], -9.81 * np.sin(s[0]))
+    angle = solve_ivp(swing, (0, 2), (0, 8), "DOP853", rtol=1e-12, atol=1e-12).y[0, -1]
+    off = sol.ys[-1, :2] * MIXED[:2] - np.array([np.sin(angle), np.cos(angle)])
+    return np.abs(off).max(), sol.result == dae_jax.RESULTS.successful
+
+
+@pytest.mark.parametrize("solver", [dae_jax.DOP853(), diffrax.Tsit5()], ids=["dop853", "tsit5"])
+def test_a_long_way_back_counts_as_an_error_beside_large_unknowns(solver):
+    off, reached = off_of_a_pendulum(OrthogonalProjection(solver), 1e-9)
+    assert reached
+    assert off < 200e-9
