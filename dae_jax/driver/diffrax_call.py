@@ -81,7 +81,9 @@ def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[
     felt = SMALL * jax.lax.stop_gradient(jnp.abs(t1 - t0)) if isinstance(solve.adjoint, OneDirection) else None
     if takes_residuals(solver):
         solver = _with_tolerances_of(controller, solver)
-        ode = dataclasses.replace(ode, felt=felt)
+        # Known steps have succeeded once; rounded in another way Newton's method may take longer for one, or seem to diverge.
+        # As an array: the step is not traced anew for it.
+        ode = dataclasses.replace(ode, felt=felt, patient=jnp.asarray(steps is not None))
         chosen = dt0 is None and not isinstance(controller, diffrax.StepTo)
         dt0 = first_step(ode.start, solver, t0, t1, y) if chosen else dt0
     else:
@@ -155,6 +157,15 @@ def failed(out: Split, problem: Problem) -> BoolScalar:
     """Whether what a `call` has given ended on its way, without an event."""
     *_, stats, _, event_mask, _, _, _ = out.numbers
     return ~jnp.any(jnp.stack([stats["end_time"] == problem.t1, *jax.tree.leaves(event_mask)]))
+
+
+def took_steps(fields: tuple[Any, ...]) -> BoolScalar:
+    """Whether all steps of a `call` to which they were given have succeeded: one that has not ends in NaN, in which a condition seems to
+    cross zero, but is not found to. (A solve that failed ends on a number, that of the last step it had.)
+    """
+    *_, (_, state), _ = fields
+    finite = [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(state)]
+    return jnp.all(jnp.stack(finite)) & (fields[6] != RESULTS.nonlinear_max_steps_reached)
 
 
 def steps_of(solve: "Solve", problem: Problem, failed: BoolScalar) -> tuple[Steps, BoolScalar]:

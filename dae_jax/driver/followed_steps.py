@@ -71,11 +71,13 @@ def reach(steps: Steps) -> BoolScalar:
     return ~jnp.isnan(steps.times[0])
 
 
-def if_reached(tree: PyTree, steps: Steps | None) -> Any:
-    """The numbers of a derivative, or NaN where its steps do not lead to the end."""
+def if_reached(tree: PyTree, steps: Steps | None, taken: BoolScalar) -> Any:
+    """The numbers of a derivative, or NaN where its steps do not lead to the end or were not `taken`: one that failed in this program
+    alone has no derivative, and what there would be is that of the steps before or after it.
+    """
     if steps is None:
         return tree
-    factor = jnp.where(reach(steps), 1.0, jnp.nan)
+    factor = jnp.where(reach(steps) & taken, 1.0, jnp.nan)
     return jax.tree.map(lambda x: x * factor.astype(x.dtype) if eqx.is_inexact_array(x) else x, tree)
 
 

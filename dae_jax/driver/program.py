@@ -26,7 +26,7 @@ from ..types import BoolScalar, Scalar, State
 from ..validate.captured import settled
 from ..validate.user_functions import refuse_wrong_functions, returned
 from .changes import changing, some_changes, with_changes
-from .diffrax_call import Decode, View, call, failed, steps_of
+from .diffrax_call import Decode, View, call, failed, steps_of, took_steps
 from .ends import Start, look
 from .event_functions import known_to_conditions, refuse_wrong_event
 from .failures import refused_on_the_way
@@ -78,7 +78,8 @@ def _numbers(program: Program, arrays: Arrays, steps: Steps | None = None) -> Sp
     solve, problem = program.whole(arrays)
     with settled(program.leaves):
         at = None if steps is None else of_bits(steps)
-        return if_reached(Split.of(call(solve, problem, at)), at)
+        found = call(solve, problem, at)
+        return if_reached(Split.of(found), at, took_steps(found))
 
 
 def _refuse_reverse(*_: object) -> Any:
@@ -222,7 +223,8 @@ class Solve:
                     solve.forwards(), saveat=recorded(solve.saveat, replays(solve.solver)), recording=True
                 )
                 record, also_arrays = recording.kernel(problem)
-                _, _, ts, ys, interpolation, *_ = record(also_arrays, *steps).numbers
+                again = record(also_arrays, *steps).whole()
+                _, _, ts, ys, interpolation, *_ = again
                 # The flags of steps come after those of the arrays.
                 numbers, others = eqx.partition(arrays, list(moving[: len(arrays)]))
                 fixed: list[Any] = []
@@ -238,7 +240,7 @@ class Solve:
                 tape = ts["tape"], ys["tape"], None if interpolation is None else interpolation.path.infos
                 of_taped = cotangents(found, Taped(*fixed), fixed_steps, tape, of_ys)
                 (of_arrays,) = through_encoding(saved_times(of_taped, self.saveat.subs, of_t0, of_t1, of_ts))
-                return inexact(if_reached(of_arrays, of_bits(*steps) if steps else None))
+                return inexact(if_reached(of_arrays, of_bits(*steps) if steps else None, took_steps(again)))
 
         return pull_back
 

@@ -23,7 +23,7 @@ from ..structure import (
     sigma_method,
     signature,
 )
-from ..types import Flat, Scalar, Time
+from ..types import BoolLike, Flat, Scalar, Time
 from .compression import Compression
 from .derivative_orders import Combination, Offsets, find_offsets
 from .index1_form import Index1Form
@@ -69,13 +69,14 @@ class LinearisedResidual(eqx.Module):
     """J + c M with J = ∂F/∂y and M = ∂F/∂ẏ, of a residual. It travels through `diffrax.diffeqsolve` as `args`.
 
     `start`: ẏ where a solve starts. `felt`: the smallest steps that are to be short enough for forward derivatives too, where the
-    program is traced for these.
+    program is traced for these. `patient`: whether steps that fail are not tried again with a smaller size.
     """
 
     form: ResidualForm | Index1Form
     structure: JacobianStructure = eqx.field(static=True)
     start: Float[Array, " n"] | None = None
     felt: Scalar | None = None
+    patient: BoolLike = False
 
     @classmethod
     def of(

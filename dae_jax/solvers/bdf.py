@@ -215,7 +215,7 @@ class BDF(Replayable, AbstractResidualSolver):
                 lambda: _start(sign * constant(args.rates(sign * t0, y0)), state.factors, state.work),
                 lambda: state,
             )
-        tol = tolerances(self.rtol, self.atol, y0.dtype)
+        tol = tolerances(self.rtol, self.atol, y0.dtype).waiting(args.patient)
         k, method = state.order, _formula(state.order, state.steps == 0, state.psi, h)
         linearised = args.solved_by(self.linear_solver)
         step, star = _predicted(method, k, state.phi, linearised, sign, t1, h, y0)

@@ -15,7 +15,7 @@ class WithoutFailedSteps(AbstractWrapper):
     """`solver` for reverse derivatives.
 
     A step whose equations have no solution ends in NaN, is rejected, and has the cotangent 0; but 0 times the NaN inside
-    of it would be NaN. Its cotangents are set to 0 here.
+    of it would be NaN. Its cotangents are set to 0 here; NaN they are if it counts after all.
     """
 
     solver: diffrax.AbstractSolver
@@ -48,7 +48,11 @@ class WithoutFailedSteps(AbstractWrapper):
         def backward(saved: Any, cotangent: Any) -> Any:
             numbers, others, found = saved
             _, pull_back = jax.vjp(lambda numbers: run(numbers, others), numbers)
-            return jax.tree.map(lambda c: jnp.where(found, c, 0), pull_back(cotangent)[0]), None
+            counts = jnp.any(
+                jnp.stack([jnp.any(c != 0) for c in jax.tree.leaves(eqx.filter(cotangent, eqx.is_inexact_array))])
+            )
+            otherwise = jnp.where(counts, jnp.nan, 0)
+            return jax.tree.map(lambda c: jnp.where(found, c, otherwise.astype(c.dtype)), pull_back(cotangent)[0]), None
 
         step = jax.custom_vjp(run)
         step.defvjp(forward, backward)

@@ -142,7 +142,7 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
         )
         linearised = args.solved_by(self.linear_solver)
         step = Step(coefficients(self.stages), linearised, time_sign(terms, t0, t1), t0, t1, y0)
-        tol = self.fitted_tolerances(y0.dtype)
+        tol = self.fitted_tolerances(y0.dtype).waiting(args.patient)
         z, (newton, jacobians, factors, work) = _stages(lambda params: _solve(*params), (step, constant(state), tol))
         y1 = y0 + z[-1]
         counted = error_of_step(*constant((step, factors.real, z, state)), tol=tol, dense=self.dense)

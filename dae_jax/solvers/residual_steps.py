@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..linalg import rms_norm
 from ..linalg.iterative import GMRES
+from ..types import BoolLike
 
 
 # As equinox has it.
@@ -35,6 +36,8 @@ NOISY = 1000
 ALIKE = 1e-6
 # The part of the step-size controller in h_new = h · SAFETY · error^(−1 / order).
 SAFETY = 0.9
+# Corrections of a step that is not tried again with a smaller size, at most.
+PATIENT = 50
 # How often a correction is halved where algebraic variables jump.
 HALVINGS = 40
 # Where algebraic variables jump, Newton's method has a Jacobian of its own for each of its corrections: damped ones first, for
@@ -104,8 +107,13 @@ class Tolerances(NamedTuple):
     atol: Any
     newton: Any
     roundoff: Any
-    corrections: int
-    patient: bool
+    corrections: Any
+    patient: BoolLike
+
+    def waiting(self, patient: BoolLike) -> "Tolerances":
+        """With as many corrections as a step may need that is not tried again with a smaller size, where `patient`."""
+        corrections = jnp.where(patient, jnp.maximum(self.corrections, PATIENT), self.corrections)
+        return self._replace(corrections=corrections, patient=jnp.asarray(self.patient) | patient)
 
     def raised(self) -> Any:
         """How much more than h^(k−1) the error of a variable of index k > 1 counts on the way between the ends of a step: its
@@ -143,7 +151,7 @@ def tolerances(rtol: Any, atol: Any, dtype: Any) -> Tolerances:
     roundoff = jnp.maximum(100 * epsilon / largest, newton / 10)
     return Tolerances(
         *lax.stop_gradient((jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype), newton, roundoff)),
-        50 if patient else 10,
+        PATIENT if patient else 10,
         patient,
     )
 
@@ -225,7 +233,7 @@ def simplified_newton(
         known = ~stagnant if pace is None else ~stagnant & ~first
         small = (eta * size <= tol.newton) & known | (size <= tol.roundoff) | (stagnant & (size <= NOISE))
         converged = small & trusted
-        diverged = ~jnp.isfinite(size) | (~first & hopeless & ~converged & (not tol.patient))
+        diverged = ~jnp.isfinite(size) | (~first & hopeless & ~converged & ~jnp.asarray(tol.patient))
         theta = jnp.where(first, 0, theta)
         return Newton(x, s.count + 1, step, eta, theta, converged & jnp.isfinite(size), diverged, s.carried), left
 

@@ -86,3 +86,52 @@ def test_wherever_a_solve_ends(case):
     )
     for field, found in zip(fields, slopes, strict=True):
         np.testing.assert_allclose(found, times[:, None] * between(field)[1] / (2 * field), atol=1e-7)
+
+
+@pytest.mark.parametrize("length", [1e3, 1e4])
+def test_a_step_in_which_newton_fails_by_round_off_alone(length):
+    """In the program of the reverse derivative one of the steps seemed to diverge, and the derivative was 0."""
+    system = dae_jax.ConstrainedSystem(
+        lambda t, q, v, a: jnp.array([0.0, 9.81]), lambda t, q, a: (q @ q - length**2) / 2
+    )
+    control = diffrax.PIDController(rtol=1e-8, atol=1e-8)
+
+    def angle(start, adjoint):
+        y0 = length * jnp.stack([jnp.sin(start), jnp.cos(start)]), jnp.zeros(2)
+        sol = dae_jax.daesolve(
+            system, dae_jax.RadauIIA5(), 0.0, 0.4 * length**0.5, None, y0, stepsize_controller=control,
+            adjoint=adjoint, event=diffrax.Event(lambda t, y, args, **kwargs: y[0][0] - 1e9),
+        )  # fmt: skip
+        return jnp.arctan2(*sol.ys[0][-1])
+
+    found = jax.grad(angle)(-0.7, diffrax.RecursiveCheckpointAdjoint())
+    np.testing.assert_allclose(found, 0.43072713, rtol=1e-6)
+    np.testing.assert_allclose(found, jax.jacfwd(angle)(-0.7, diffrax.ForwardMode()), rtol=1e-6)
+
+
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("event", [False, True])
+@pytest.mark.parametrize("solver", [dae_jax.RadauIIA5, dae_jax.BDF])
+def test_a_step_that_fails_in_the_derivative_alone(solver, event, mode, monkeypatch):
+    """There is no derivative then; it was that of the steps before it, or after it, or 0."""
+    as_it_was = solver.step
+
+    def step(self, terms, t0, t1, y0, args, *state):
+        y1, error, dense, new, result = as_it_was(self, terms, t0, t1, y0, args, *state)
+        fails = args.patient & (t0 < 0.5) & (t1 >= 0.5)
+        result = diffrax.RESULTS.where(fails, diffrax.RESULTS.nonlinear_divergence, result)
+        return jnp.where(fails, jnp.nan, y1), jnp.where(fails, jnp.inf, error), dense, new, result
+
+    monkeypatch.setattr(solver, "step", step)
+    system = dae_jax.ConstrainedSystem(lambda t, q, v, g: jnp.stack([0 * g, g]), lambda t, q, g: (q @ q - 1) / 2)
+
+    def height(g):
+        sol = dae_jax.daesolve(
+            system, solver(), 0.0, 1.0, None, (jnp.array([1.0, 0.0]), jnp.zeros(2)), g,
+            adjoint=diffrax.ForwardMode() if mode is jax.jacfwd else diffrax.RecursiveCheckpointAdjoint(),
+            event=diffrax.Event(lambda t, y, g, **kwargs: y[0][0] - 50) if event else None,
+        )  # fmt: skip
+        return sol.ys[0][-1, 1]
+
+    assert jnp.isfinite(height(9.81))
+    assert jnp.isnan(mode(height)(9.81))
