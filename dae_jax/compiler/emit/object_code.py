@@ -3,7 +3,6 @@
 import ctypes
 import hashlib
 import importlib.metadata
-import re
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -23,16 +22,12 @@ SPEED = 2
 TUNING = {"loop_vectorization": True, "slp_vectorization": False, "loop_unrolling": False, "loop_interleaving": False}
 # Modules of more lines become machine code as they are: LLVM's passes would take 6 s and more.
 HEAVY = 45_000
-# And modules that compute so many addresses, unless one of `PER_LOOP` is in a loop of `LONG` turns or more. What LLVM's passes take
-# grows with the memory that is written to, what they gain comes from long loops: the double pendulum by dummy derivatives (6,000
-# addresses, 46 long loops) is ready in 4.6 s without them and in 8.1 with, and takes 3.6 and 2.9 ms, and after its kernel has become
-# shorter (4,500) in 6.3 and 8.5 s, and takes 26 and 20 ms; Andrews' mechanism by Radau (7,000 and 340) in 6 and 12 s, and takes 49 and
-# 22 ms.
-ADDRESSES, PER_LOOP, LONG = 4_000, 50, 25
-# And modules of more loops, each of which takes the passes 10 ms, unless a half of them is `VERY_LONG`: one evaluation of a Stewart
-# platform (730) is ready in 7.7 s with them and in 1.5 without, and takes 45 and 63 µs; Andrews' mechanism by Radau (440) gains by them,
-# and so does a system of 3,000 unknowns by Radau (530, of which 460 are long), which takes 400 ms and 870 without.
-LOOPS, VERY_LONG = 500, 256
+# And modules that compute so many addresses, or have so many loops: what LLVM's passes take grows with the memory that is written to, and
+# by 10 ms with each loop, and what they gained there were loops of vectors, as which loops are written now. A heat equation of 900
+# unknowns by Radau (490 loops) is ready in 6.3 s without them and in 11.4 with, and takes as long, a chain of 24 pendulums (480) in 5.3 and
+# 10.4; the car axis by Radau (260 loops, 3,100 addresses) in 4.9 and 7.0, but takes 16 and 6 ms; Andrews' mechanism by Radau (460) in 14
+# and 23, 21 and 14 ms. Measured on a busy machine.
+ADDRESSES, LOOPS = 4_000, 400
 
 
 # From as many lines on what is only looked at, as the start and the end of a solve, is made in the least time: of a four-bar linkage in
@@ -41,8 +36,6 @@ LONG_LOOK = 10_000
 
 # Where the index of a loop over an array begins.
 _LOOP = "= phi i64 [ 0,"
-# The last index of one.
-_TURNS = re.compile(r"icmp \w+ i64 %\S+, (\d+)")
 
 
 def key(text: str, target: Target, optimise: bool) -> str:
@@ -58,10 +51,7 @@ def key(text: str, target: Target, optimise: bool) -> str:
         TUNING,
         HEAVY,
         ADDRESSES,
-        PER_LOOP,
-        LONG,
         LOOPS,
-        VERY_LONG,
         SPLITTING,
         text,
     )
@@ -103,11 +93,7 @@ def object_code(module: Module, show: Callable[[str, str], None] | None = None) 
 
 def _gains_by_passes(text: str) -> bool:
     """Whether LLVM's passes gain more than they take."""
-    loops, longer = text.count(_LOOP), lambda least: sum(int(last) >= least for last in _TURNS.findall(text))
-    if text.count("\n") >= HEAVY or (loops > LOOPS and 2 * longer(VERY_LONG) < loops):
-        return False
-    addresses = text.count("getelementptr")
-    return addresses < ADDRESSES or PER_LOOP * longer(LONG) > addresses
+    return text.count("\n") < HEAVY and text.count("getelementptr") < ADDRESSES and text.count(_LOOP) <= LOOPS
 
 
 def parsed(text: str) -> Any:
