@@ -1,5 +1,7 @@
 """Second derivatives of a solve, in each order of modes, are differences of its gradients."""
 
+import itertools
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -95,6 +97,18 @@ def test_of_a_kernel(order, pull_back):
     np.testing.assert_allclose(order(batch(fused))(weight), order(batch(cubic))(weight), rtol=1e-12)
     each = lambda fn: jax.vmap(order(of(fn)))(xs)
     np.testing.assert_allclose(each(fused), each(cubic), rtol=1e-12)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("then", [0, 1])
+def test_by_two_arguments(first, then):
+    """What moves first and what moves then are not the same arrays, and have derivatives of other shapes."""
+    plain = lambda x, p, n: jnp.sum(jnp.sin(x * p[0]) * x + p[1] ** n)
+    fused = one_kernel(plain, "reverse")
+    at = X, jnp.array([0.3, 1.1, 0.7]), 3
+    for outer, inner in itertools.product((jax.jacfwd, jax.jacrev), (jax.jacfwd, jax.grad)):
+        found, expected = (outer(inner(fn, first), then)(*at) for fn in (fused, plain))
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14)
 
 
 def test_third_derivatives_are_forward_ones():
