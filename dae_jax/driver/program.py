@@ -270,9 +270,9 @@ class Solve:
                 return by_felt_steps(solved, given, changes)
 
         def way(args: tuple[Arrays], out: Split) -> Steps:
-            (arrays,) = jax.lax.stop_gradient(args)
-            problem = program.whole(arrays)[1]
             *_, end, _ = out.whole()
+            (arrays,), end = jax.lax.stop_gradient((args, end))
+            problem = program.whole(arrays)[1]
             changes = as_kernel(changes_of, often=False)(arrays, end)
             found = as_kernel(steps)(arrays, changes, failed(out, problem))
             return refused_on_the_way(found, most) if self.throw else found
