@@ -60,7 +60,7 @@ def test_equals_diffrax_with_respect_to_everything(name, saveat, steps):
     form = dae_jax.DummyDerivatives() if name == "selected states" else None
     solver = SOLVERS[name]
     # The tape's steps are those of a derivative: equal up to the tolerance.
-    tight = {"stepsize_controller": diffrax.PIDController(1e-10, 1e-10)} if steps == "adaptive" else {}
+    tight = {"stepsize_controller": diffrax.PIDController(1e-11, 1e-11)} if steps == "adaptive" else {}
     of = lambda x, **options: loss(x, saveat, solver, dt0, *times, form, **tight, **options)
     taped = jax.grad(of)(x)
     if name in BACKWARDS_BY_DIFFRAX:
