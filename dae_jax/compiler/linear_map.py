@@ -69,14 +69,20 @@ def is_inexact(x: ArrayLike) -> bool:
     return jnp.issubdtype(jnp.result_type(x), jnp.inexact)
 
 
-def moved(fn: Callable[[Arrays], Arrays], at: Arrays, moving: Moving, changes: Arrays) -> Arrays:
-    """How `fn(at)` changes with the arrays in `at` that are `moving`."""
+def of_moving(fn: Callable[[Arrays], Any], at: Arrays, moving: Sequence[bool]) -> tuple[Callable[..., Any], Arrays]:
+    """`fn(at)` as a function of those arrays in `at` that are `moving`, and these."""
 
-    def of_moving(*zs: Array) -> Arrays:
+    def values(*zs: Array) -> Any:
         rest = iter(zs)
         return fn([next(rest) if m else x for x, m in zip(at, moving, strict=True)])
 
-    return jax.jvp(of_moving, tuple(x for x, m in zip(at, moving, strict=True) if m), tuple(changes))[1]
+    return values, [x for x, m in zip(at, moving, strict=True) if m]
+
+
+def moved(fn: Callable[[Arrays], Arrays], at: Arrays, moving: Sequence[bool], changes: Arrays) -> Arrays:
+    """How `fn(at)` changes with the arrays in `at` that are `moving`."""
+    values, xs = of_moving(fn, at, moving)
+    return jax.jvp(values, tuple(xs), tuple(changes))[1]
 
 
 def forward_map(
@@ -114,20 +120,15 @@ def derivative_map(
     """
     n, count = len(moving), sum(moving)
 
-    def of_moving(at: Arrays) -> tuple[Callable[..., Arrays], Arrays]:
-        def values(*zs: Array) -> Arrays:
-            rest = iter(zs)
-            return list(filter(is_inexact, fn([next(rest) if m else x for x, m in zip(at, moving, strict=True)])))
-
-        return values, [x for x, m in zip(at, moving, strict=True) if m]
+    def values(at: Arrays) -> Arrays:
+        return list(filter(is_inexact, fn(at)))
 
     def pushed(at: Arrays, dxs: Arrays) -> Arrays:
-        values, xs = of_moving(at)
-        return jax.jvp(values, tuple(xs), tuple(dxs))[1]
+        return moved(values, at, moving, dxs)
 
     def pulled(at: Arrays, cotangents: Arrays) -> Arrays:
-        values, xs = of_moving(at)
-        return list(jax.vjp(values, *xs)[1](list(cotangents)))
+        of_xs, xs = of_moving(values, at, moving)
+        return list(jax.vjp(of_xs, *xs)[1](list(cotangents)))
 
     def change(apply: Callable[[Arrays, Arrays], Arrays], of: int, found: int, moving: Moving) -> LinearMap:
         also, still = [*inexact, *[True] * of], [*moving, *[False] * of]

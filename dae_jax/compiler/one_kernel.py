@@ -18,7 +18,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from .kernel_call import as_kernel
-from .linear_map import Arrays, LinearMap, Moving, batched_alike, forward_map, is_inexact, moved
+from .linear_map import Arrays, LinearMap, Moving, batched_alike, forward_map, is_inexact, moved, of_moving
 from .settings import one_kernel_enabled
 from .types import TreeDef
 
@@ -174,14 +174,8 @@ def _derivative(of: _Changes) -> Callable[[Moving], LinearMap]:
 def _plain_pull_back(fn: Callable[..., Any]) -> PullBack:
     def pull_back(args: PyTree, cotangent: PyTree, moving: Moving) -> list[Any]:
         leaves, treedef = jax.tree.flatten(args)
-
-        def of_moving(*zs: Array) -> list[Any]:
-            rest = iter(zs)
-            merged = [next(rest) if m else x for m, x in zip(moving, leaves, strict=True)]
-            return inexact(fn(*jax.tree.unflatten(treedef, merged)))
-
-        at = [x for m, x in zip(moving, leaves, strict=True) if m]
-        return list(jax.vjp(of_moving, *at)[1](inexact(cotangent)))
+        values, at = of_moving(lambda xs: inexact(fn(*jax.tree.unflatten(treedef, xs))), leaves, moving)
+        return list(jax.vjp(values, *at)[1](inexact(cotangent)))
 
     return pull_back
 
