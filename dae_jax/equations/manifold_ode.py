@@ -87,6 +87,10 @@ class ManifoldODE(eqx.Module):
     def normals(self, t: Time, y: Y) -> Any:
         """Directions that span a complement of the manifold's tangent space at (t, y), and what is needed to use them."""
 
+    def lasting_normals(self, t0: Time, y0: Y, t1: Time, ahead: Y) -> Any:
+        """Those at (t₀, y₀), or such as stay transversal to the manifold in a step to near (t₁, `ahead`)."""
+        return self.normals(t0, y0)
+
     @abc.abstractmethod
     def displace(self, y: Y, normals: Normals, mu: Float[Array, " c"]) -> Any:
         """y + N μ, with the normals N and a flat vector μ."""

@@ -46,6 +46,8 @@ from .taylor import total_derivatives
 STARTING = 100
 # A selection of states is kept until its smallest pivot is less than this part of the best one's.
 HYSTERESIS = 0.3
+# A selection is to be good for so many steps of the present size; a chart is as it is while less than this part of a normal turns in one.
+STEPS, TURNS = 100, 0.05
 # With more equations, or constraints, a determinant takes longer than a step.
 ORIENTED = 32
 # What of H may be round-off, in parts of its terms and of the resolution of numbers.
@@ -262,6 +264,19 @@ class StructuralODE(ManifoldODE):
         """∂H/∂Y, whose rows are normal to the manifold in the metric in which all entries of Y count alike."""
         return jax.jacfwd(self.violations, 1)(t, y)
 
+    def lasting_normals(
+        self, t0: Time, y0: Float[Array, " N"], t1: Time, ahead: Float[Array, " N"]
+    ) -> Float[Array, "m N"]:
+        """The normals, or, where one leads away from the manifold within some such steps, as with units that are far apart, their
+        entries that last.
+        """
+        here = self.normals(t0, y0)
+        if not len(here):
+            return here
+        there = lax.stop_gradient(self.normals(t1, ahead))
+        along = jnp.abs(jnp.sum((there - here) * here, 1)) / jnp.sum(here * here, 1)
+        return jnp.where(jnp.any(along > TURNS), _lasting(here, there), here)
+
     def sizes(self, t: Time, y: Float[Array, " N"], of: tuple[Float[Array, " N"], ...]) -> list[Float[Array, " m"]]:
         """Σ |∂H/∂Y| s of each invariant, for each s in `of`."""
         if self.sparse is not None:
@@ -317,17 +332,24 @@ class StructuralODE(ManifoldODE):
         return self.displace(y, normals, mu), found
 
     def selection(
-        self, t: Time, y: Float[Array, " N"], chosen: Float[Array, "m N"] | None
+        self,
+        t: Time,
+        y: Float[Array, " N"],
+        chosen: Float[Array, "m N"] | None,
+        ahead: tuple[Time, Float[Array, " N"]] | None = None,
     ) -> tuple[Float[Array, "m N"], Bool[Array, ""]]:
         """Unit directions of the dummy derivatives, entries of Y that H = 0 determines given the others, and whether they
         are not `chosen`.
 
         Level by level, from the highest: the equations with Cᵢ ≥ k determine the derivatives of order Dⱼ − k of as many
-        variables, taken by complete pivoting on the system Jacobian from those that the level before has taken.
+        variables, taken by complete pivoting on the system Jacobian from those that the level before has taken; on entries that
+        change little in a step to the point `ahead` first.
         """
         d = np.array(self.orders.variables)
         matrix = lax.stop_gradient(self._system(t, y, None)[0])
         largest = jnp.max(jnp.abs(matrix), 1, keepdims=True)
+        if ahead is not None and self.varying:
+            matrix = _lasting(matrix, lax.stop_gradient(self._system(*ahead, None)[0]))
         matrix = matrix / jnp.where(largest > 0, largest, 1)
         infinite = jnp.asarray(jnp.inf, y.dtype)
         available, quality, present, first, directions = jnp.ones(len(d), y.dtype), infinite, infinite, 0, []
@@ -450,6 +472,15 @@ def _nearest(
 
 def _by_y(*_: object) -> Any:
     raise NotImplementedError(f"The derivative of a consistent state is for up to {LARGE} unknowns.")
+
+
+def _lasting(start: Float[Array, "n n"], end: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """The entries of a matrix at a step's start, those less that change within some such steps: of an unknown in a large unit an entry
+    is large beside others until just before it is 0. Entries that are not known at the predicted end stay.
+    """
+    size, change = jnp.abs(start), STEPS * jnp.abs(end - start)
+    part = size / jnp.where(size > 0, size + change, 1)
+    return start * jnp.where(jnp.isnan(part), 1, part) ** 4
 
 
 def _pivots(a: Float[Array, "m N"]) -> tuple[Float[Array, "m N"], Float[Array, ""]]:

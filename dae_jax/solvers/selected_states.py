@@ -63,12 +63,13 @@ class SelectedStates(Replayable, AbstractChartSolver):
         solver_state: Selection,
         made_jump: BoolLike,
     ) -> Any:
-        directions, switched = args.selection(time_sign(terms, t0, t1) * t0, y0, solver_state.directions)
+        sign = time_sign(terms, t0, t1)
+        ahead = y0 + terms.contr(t0, t1) * solver_state.inner
+        directions, switched = args.selection(sign * t0, y0, solver_state.directions, (sign * t1, ahead))
         y1, error, dense, derivative, result = self.step_in(
             directions, terms, t0, t1, y0, args, solver_state.inner, made_jump
         )
         if len(directions):
-            sign = time_sign(terms, t0, t1)
             before, after = args.orientation(sign * t0, y0, directions), args.orientation(sign * t1, y1, directions)
             stays = jnp.all(before * after > 0)
             if self.dense:
@@ -166,10 +167,10 @@ class SelectedResiduals(Replayable, AbstractResidualSolver):
         solver_state: Selection,
         made_jump: BoolLike,
     ) -> Any:
-        ode = args.form.ode
-        directions, switched = ode.selection(
-            time_sign(terms, t0, t1) * t0, y0[: ode.orders.size], solver_state.directions
-        )
+        ode, sign = args.form.ode, time_sign(terms, t0, t1)
+        y, rates = (x[: args.form.ode.orders.size] for x in (y0, args.form.known_rates(y0)))
+        ahead = y + terms.contr(t0, t1) * rates
+        directions, switched = ode.selection(sign * t0, y, solver_state.directions, (sign * t1, ahead))
         solver = dataclasses.replace(self.solver, rtol=self.rtol, atol=self.atol)
         state = jax.tree.map(
             lambda a, b: jnp.where(switched, a, b), self.invalidate_jacobian(solver_state), solver_state
@@ -178,6 +179,12 @@ class SelectedResiduals(Replayable, AbstractResidualSolver):
             terms, t0, t1, y0, _selected(args, directions), state.inner, made_jump
         )
         dense = {"inner": dense, "directions": directions}
+        if len(directions):
+            there = y1[: ode.orders.size]
+            before, after = ode.orientation(sign * t0, y, directions), ode.orientation(sign * t1, there, directions)
+            stays = jnp.all(before * after > 0)
+            y1, error = or_nan(stays, y1), or_nan(stays, error)
+            result = diffrax.RESULTS.where(stays, result, outcome(stays))
         return y1, error, dense, Selection(inner, directions, solver_state.switches + switched), result
 
     def history_at_start(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any) -> Any:

@@ -3,6 +3,7 @@
 from typing import Any
 
 import diffrax
+import jax
 from jaxtyping import PyTree
 
 from ..equations.manifold_ode import ManifoldODE
@@ -46,5 +47,7 @@ class TangentSpace(AbstractChartSolver):
         solver_state: PyTree,
         made_jump: BoolLike,
     ) -> Any:
-        chart = args.normals(time_sign(terms, t0, t1) * t0, y0)
+        sign, h = time_sign(terms, t0, t1), terms.contr(t0, t1)
+        ahead = jax.tree.map(lambda y, rate: y + h * rate, y0, solver_state)
+        chart = args.lasting_normals(sign * t0, y0, sign * t1, ahead)
         return self.step_in(chart, terms, t0, t1, y0, args, solver_state, made_jump)

@@ -110,3 +110,51 @@ def test_a_long_way_back_counts_as_an_error_beside_large_unknowns(solver):
     off, reached = off_of_a_pendulum(OrthogonalProjection(solver), 1e-9)
     assert reached
     assert off < 200e-9
+
+
+ON_A_SUPPORT = jnp.array([1e-3, 1e3, 1e-6, 1e4, 1e-5])
+
+
+def off_of_a_pendulum_on_a_moving_support(solver, formulation, tolerance):
+    """The same in these units, held at (0.3 sin 2t, 0): how far it is off at saved times, relative to each unknown's largest value, and
+    whether the end was reached.
+    """
+    support = lambda t: 0.3 * jnp.sin(2 * t)
+
+    def residual(t, state, rates, args):
+        (x, y, u, v, pull), (xd, yd, ud, vd, _) = state * ON_A_SUPPORT, rates * ON_A_SUPPORT
+        across = x - support(t)
+        return jnp.stack([xd - u, yd - v, ud + pull * across, vd + pull * y - 9.81, (across**2 + y**2 - 1) / 2])
+
+    ts = np.linspace(0, 2, 41)
+    swing = lambda t, s: (s[1], -9.81 * np.sin(s[0]) + 1.2 * np.sin(2 * t) * np.cos(s[0]))
+    angle, speed = solve_ivp(swing, (0, 2), (0, 8), "DOP853", rtol=1e-13, atol=1e-13, t_eval=ts).y
+    sin, cos = np.sin(angle), np.cos(angle)
+    pull = speed**2 + 9.81 * cos + 1.2 * np.sin(2 * ts) * sin
+    exact = np.stack([0.3 * np.sin(2 * ts) + sin, cos, 0.6 * np.cos(2 * ts) + cos * speed, -sin * speed, pull], 1)
+    controller = diffrax.PIDController(rtol=tolerance, atol=tolerance * 1e-4)
+    sol = dae_jax.daesolve(
+        ImplicitDAE(residual), solver, 0.0, 2.0, None, jnp.asarray(exact[0]) / ON_A_SUPPORT, formulation=formulation,
+        saveat=diffrax.SaveAt(ts=jnp.asarray(ts)), stepsize_controller=controller, max_steps=20_000, throw=False,
+    )  # fmt: skip
+    off = np.abs(np.asarray(sol.ys * ON_A_SUPPORT) - exact) / np.abs(exact).max(0)
+    return off.max(), sol.result == dae_jax.RESULTS.successful
+
+
+@pytest.mark.parametrize(
+    ("solver", "formulation"),
+    [
+        (dae_jax.BDF(), dae_jax.DummyDerivatives()),
+        (dae_jax.RadauIIA5(), dae_jax.DummyDerivatives()),
+        (dae_jax.DOP853(), dae_jax.DummyDerivatives()),
+        (dae_jax.TangentSpace(dae_jax.DOP853()), None),
+    ],
+    ids=["bdf", "radau", "explicit", "tangent"],
+)
+def test_states_and_charts_are_chosen_in_any_unit(solver, formulation):
+    """Near y = 0, which is small in km, x has to follow from y, though its entry in the constraint is small in mm. (`BDF` was off by up to
+    86,000 tolerances, `TangentSpace` by 1,000 to 200,000; the others stood still there.)
+    """
+    off, reached = off_of_a_pendulum_on_a_moving_support(solver, formulation, 1e-7)
+    assert reached
+    assert off < 1000e-7
