@@ -45,6 +45,7 @@ def level_at_start(
     y: State,
     args: Args,
     before: Scalar,
+    changed: Scalar,
     rank: int | Rank | None,
     together: Scalar,
     found: Scalar,
@@ -56,10 +57,10 @@ def level_at_start(
     backwards, or 0 where it is not seen to leave. And what it is off by, and for how long it may not have left zero by as much.
 
     The sign is that of its rate after half the time that is `together`, from rest that of its first derivative that is not zero; the
-    sign with which it came, −`before`, where its rate is not known. What a reset has brought to rest stays on the side `before` it, so
-    that resets pile up where it is pulled through zero. Zero is what the condition moves by in that time, what may be round-off of the
-    state in it, the value at which it was `found` to be zero, and, where it has `moved`, what it is off by: that and the error of the
-    state.
+    sign with which it came, −`before`, where its rate is not known. What a reset that has `changed` the state has brought to rest stays
+    on the side `before` it, so that resets pile up where it is pulled through zero. Zero is what the condition moves by in that time,
+    what may be round-off of the state in it, the value at which it was `found` to be zero, and, where it has `moved`, what it is off
+    by: that and the error of the state.
     """
     value = jnp.asarray(condition(t, y, args))
     # The state as it is: one made anew from the underlying ODE is NaN where the structure allows what the numbers do not.
@@ -69,7 +70,7 @@ def level_at_start(
     points = (t, z), (t + after, jax.tree.map(lambda z, zd: z + after * zd, z, flows[1]))
     first, then = (jax.jvp(of, at, (jnp.ones_like(t), zd))[1] for at, zd in zip(points, flows, strict=True))
     rests = jnp.abs(first) < jnp.abs(then - first)
-    side = jnp.where(jnp.isfinite(then), jnp.where(rests & (before != 0), before, sign * jnp.sign(then)), -before)
+    side = jnp.where(jnp.isfinite(then), jnp.where(rests & (changed > 0), before, sign * jnp.sign(then)), -before)
     rate = jnp.where(jnp.isfinite(then), jnp.abs(then), 0)
     slopes = jax.tree.leaves(jax.grad(of, 1)(t, z))
     terms = sum(jnp.sum(jnp.abs(slope * x)) for slope, x in zip(slopes, jax.tree.leaves(z), strict=True))
@@ -83,7 +84,7 @@ def level_at_start(
     leaves = jnp.abs(value) <= zero
     level = jnp.where(leaves, side * zero, value)
     # From rest the error of the first steps outruns the condition.
-    off = jnp.where(rests & (before == 0), jnp.maximum(off, error), off)
+    off = jnp.where(rests & (changed == 0), jnp.maximum(off, error), off)
     near = jnp.where(leaves, 2 * off / jnp.maximum(rate, jnp.finfo(t.dtype).tiny), 0)
     return lax.stop_gradient((level, off, near))
 

@@ -96,8 +96,8 @@ def Jump(
 
 class _Progress(NamedTuple):
     """Where a solve stands: the start of the next part, what was saved so far, `changed` of the args beside, and how the last part
-    ended; `side` is the sign that the condition had in the last part, `found` its value at the last reset, `moved` by how much making the
-    state after that consistent has changed it.
+    ended; `side` is the sign that the condition had in the last part, `changed_y` whether the last reset changed the state, `found` the
+    condition there, `moved` by how much making the state after that consistent has changed it.
     """
 
     t: Float[Array, ""]
@@ -111,6 +111,7 @@ class _Progress(NamedTuple):
     stats: Any
     code: Int[Array, ""]
     side: Float[Array, ""]
+    changed_y: Float[Array, ""]
     found: Float[Array, ""]
     moved: Float[Array, ""]
 
@@ -148,8 +149,9 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Start]
     def part(p: _Progress) -> tuple[DAESolution, Any]:
         args = eqx.combine(p.args, others)
         level, off, near = level_at_start(
-            system, reset.condition, sign, p.t, p.y, args, p.side, rank, together, p.found, p.moved, *tolerances
-        )
+            system, reset.condition, sign, p.t, p.y, args, p.side, p.changed_y, rank, together, p.found, p.moved,
+            *tolerances,
+        )  # fmt: skip
         near = jnp.minimum(near, SAME * jnp.abs(t1 - t0))
         # A downcrossing, as bisection has to know which way it goes.
         side = jnp.asarray({True: -1, False: 1, None: jnp.sign(level)}[reset.direction], t0.dtype)
@@ -178,10 +180,10 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Start]
         code = sol.result._value
         piled = (p.count > 0) & (sign * (end - p.t) <= together)
         jumps, exhausted = code == going, piled | (p.count >= reset.max_resets)
-        y, after, *found_and_moved = lax.cond(
+        y, after, *of_reset = lax.cond(
             jumps & ~exhausted,
             lambda: _after(system, reset, end, reached, eqx.combine(p.args, others)),
-            lambda: (jax.tree.map(jnp.asarray, reached), p.args, unknown, unknown),
+            lambda: (jax.tree.map(jnp.asarray, reached), p.args, unknown, unknown, unknown),
         )
         times = jnp.where((jnp.arange(reset.max_resets) == p.count) & jumps & ~exhausted, end, p.times)
         code = jnp.where(jumps & exhausted, RESULTS.too_many_jumps._value, code)
@@ -189,12 +191,12 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Start]
             lost = (side == 0) & _differs(reset.condition, end, reached, eqx.combine(p.args, others), *tolerances)
             code = jnp.where(lost & (code == RESULTS.successful._value), RESULTS.undetermined_side._value, code)
         return _Progress(
-            end, y, after, p.count + (jumps & ~exhausted), times, ts, ys, changed, stats, code, side, *found_and_moved
+            end, y, after, p.count + (jumps & ~exhausted), times, ts, ys, changed, stats, code, side, *of_reset
         )
 
     none: Any = None
     shape = jax.eval_shape(
-        part, _Progress(t0, y0, numbers, none, none, none, none, none, none, none, unknown, unknown, unknown)
+        part, _Progress(t0, y0, numbers, none, none, none, none, none, none, none, unknown, unknown, unknown, unknown)
     )[0]
     unsaved = jax.tree.map(lambda x: jnp.full(x.shape, jnp.inf, x.dtype), shape.ys["wanted"])
     stats = {k: jnp.zeros((), int) for k in shape.stats if k not in NO_COUNTS}
@@ -203,7 +205,7 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Start]
     start = _Progress(
         t0, y0, numbers, jnp.zeros((), int), jnp.full(reset.max_resets, jnp.inf, t0.dtype),
         jnp.full_like(wanted, jnp.inf), unsaved, given, stats, jnp.asarray(going, RESULTS.successful._value.dtype), unknown,
-        unknown, unknown,
+        unknown, unknown, unknown,
     )  # fmt: skip
     kind: Any = "checkpointed" if solve.derivative() == "reverse" else "lax"
     max_steps = reset.max_resets + 1 if kind == "checkpointed" else None
@@ -248,9 +250,9 @@ def _changes(reset: Reset, t: Time, y: State, args: Args) -> PyTree[bool]:
     return found[0]
 
 
-def _after(system: System, reset: Reset, t: Time, y: State, args: Args) -> tuple[Any, Any, Scalar, Scalar]:
-    """The state and the numbers in the args after a reset; the condition before it, which is zero but for the resolution of time, and by
-    how much it has moved with the state that is consistent.
+def _after(system: System, reset: Reset, t: Time, y: State, args: Args) -> tuple[Any, Any, Scalar, Scalar, Scalar]:
+    """The state and the numbers in the args after a reset; whether the state is another; the condition before it, which is zero but for
+    the resolution of time, and by how much it has moved with the state that is consistent.
     """
     wanted, new = reset.reset(t, y, args)
     consistent = consistent_state(system, t, wanted, new, fixed=reset.fixed)
@@ -258,4 +260,5 @@ def _after(system: System, reset: Reset, t: Time, y: State, args: Args) -> tuple
     numbers = (eqx.filter(a, _is_number) for a in (new, args))
     after = jax.tree.map(lambda x, like: jnp.asarray(x, jnp.result_type(like)), *numbers)
     found, moved = lax.stop_gradient((jnp.abs(of(y, args)), jnp.abs(of(consistent, new) - of(wanted, new))))
-    return consistent, after, found, moved
+    other = jnp.any(jnp.stack([jnp.any(a != b) for a, b in zip(*map(jax.tree.leaves, (wanted, y)), strict=True)]))
+    return consistent, after, other.astype(found.dtype), found, moved

@@ -75,3 +75,14 @@ def test_from_rest_backwards(solver):
     sol = dae_jax.daesolve(wire, solver, 3.0, 1.8, None, AT_ZERO, event=turn)
     assert sol.stats["jumps"] == 1
     np.testing.assert_allclose(sol.stats["jump_times"][0], 2.0, atol=1e-8)
+
+
+@pytest.mark.parametrize("direction", [None, False])
+def test_what_a_reset_lets_go_falls(direction):
+    """It is held at zero until t = 1.5: the reset has not brought it to rest."""
+    wire = dae_jax.ConstrainedSystem(lambda t, q, v, held: jnp.stack([0 * t, (held - 1) * 9.81]), lambda t, q, a: q[0])
+    condition = lambda t, y, held, **_: jnp.where(held > 0, 1.5 - t, y[0][1])
+    let_go = dae_jax.Reset(condition, lambda t, y, held: (y, 0.0 * held), direction)
+    sol = dae_jax.daesolve(wire, SOLVERS["projection"], 0.0, 2.0, None, AT_ZERO, 1.0, event=let_go)
+    assert sol.stats["jumps"] == 1
+    np.testing.assert_allclose(sol.ys[0][-1, 1], -9.81 / 8, atol=1e-8)
