@@ -119,6 +119,11 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "There were more resets than `Reset(max_resets=...)` allows: raise it, or look whether they pile up at one time, as "
         "those of a ball that comes to rest do."
     )
+    undetermined_side = (
+        "The condition of a Reset is zero at the start, or after a reset, stays there for a while, and is not zero at the end: it "
+        "was not seen to which side it went, nor whether it came back. Say which crossings count: "
+        "`Reset(condition, reset, direction=True)` (upwards) or `direction=False`."
+    )
 
 
 # A success says so where it is printed.

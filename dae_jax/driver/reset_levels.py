@@ -45,32 +45,52 @@ def level_at_start(
     y: State,
     args: Args,
     before: Scalar,
+    changed: Scalar,
     rank: int | Rank | None,
     together: Scalar,
+    found: Scalar,
     moved: Scalar,
     rtol: Scalar,
     atol: Scalar,
 ) -> Any:
     """The condition at the start of a part; where this is zero, the sign with which it leaves zero, forwards or, with `sign` −1,
-    backwards. That is the sign with which it came, −`before`, where its rate is not known. Zero is what the condition moves by
-    while times are `together`, what may be round-off of the state in it, and, where it has `moved`, what it is off by: that and the
-    error of the state, relative to it and absolute. And what it is off by, and for how long it may not have left zero by as much.
+    backwards, or 0 where it is not seen to leave. And what it is off by, and for how long it may not have left zero by as much.
+
+    The sign is that of its rate after half the time that is `together`, from rest that of its first derivative that is not zero; the
+    sign with which it came, −`before`, where its rate is not known. What a reset that has `changed` the state has brought to rest stays
+    on the side `before` it, so that resets pile up where it is pulled through zero. Zero is what the condition moves by in that time,
+    what may be round-off of the state in it, the value at which it was `found` to be zero, and, where it has `moved`, what it is off
+    by: that and the error of the state.
     """
     value = jnp.asarray(condition(t, y, args))
     # The state as it is: one made anew from the underlying ODE is NaN where the structure allows what the numbers do not.
-    z, decode, zd = flow(system, t, y, args, rank, together)
+    after = sign * together / 2
+    z, decode, *flows = flow(system, t, y, args, rank, 2 * after)
     of = lambda t, z: jnp.asarray(condition(t, decode(t, z), args), t.dtype)
-    _, rate = jax.jvp(of, (t, z), (jnp.ones_like(t), zd))
-    rate = jnp.where(jnp.isfinite(rate), sign * rate, -before)
+    points = (t, z), (t + after, jax.tree.map(lambda z, zd: z + after * zd, z, flows[1]))
+    first, then = (jax.jvp(of, at, (jnp.ones_like(t), zd))[1] for at, zd in zip(points, flows, strict=True))
+    rests = jnp.abs(first) < jnp.abs(then - first)
+    side = jnp.where(jnp.isfinite(then), jnp.where(rests & (changed > 0), before, sign * jnp.sign(then)), -before)
+    rate = jnp.where(jnp.isfinite(then), jnp.abs(then), 0)
     slopes = jax.tree.leaves(jax.grad(of, 1)(t, z))
     terms = sum(jnp.sum(jnp.abs(slope * x)) for slope, x in zip(slopes, jax.tree.leaves(z), strict=True))
     round_off = ROUND_OFF * jnp.finfo(t.dtype).eps * jnp.where(jnp.isfinite(terms), terms, 0)
     # Where the state had to be made consistent it is off by its error, and will be: algebraic unknowns included.
-    by_state = jax.grad(lambda y: jnp.asarray(condition(t, y, args), t.dtype))(y)
-    error = jax.tree.map(lambda slope, x: jnp.sum(jnp.abs(slope) * (rtol * jnp.abs(x) + atol)), by_state, y)
-    off = jnp.where(moved > round_off, 2 * moved + ERRORS * sum(jax.tree.leaves(error)), 0)
-    zero = jnp.abs(rate) * together + round_off + off
-    leaves = (jnp.abs(value) <= zero) & (rate != 0)
-    level = jnp.where(leaves, jnp.where(rate > 0, zero, -zero), value)
-    near = jnp.where(leaves, 2 * off / jnp.where(leaves, jnp.abs(rate), 1), 0)
+    error = error_of(condition, t, y, args, rtol, atol)
+    off = jnp.where(moved > round_off, 2 * moved + ERRORS * error, 0)
+    # Where the condition jumps over zero, more was found.
+    found = jnp.where(found <= error, found, 0)
+    zero = rate * together + round_off + 2 * found + off
+    leaves = jnp.abs(value) <= zero
+    level = jnp.where(leaves, side * zero, value)
+    # From rest the error of the first steps outruns the condition.
+    off = jnp.where(rests & (changed == 0), jnp.maximum(off, error), off)
+    near = jnp.where(leaves, 2 * off / jnp.maximum(rate, jnp.finfo(t.dtype).tiny), 0)
     return lax.stop_gradient((level, off, near))
+
+
+def error_of(condition: Callable[..., Time], t: Scalar, y: State, args: Args, rtol: Scalar, atol: Scalar) -> Scalar:
+    """By how much the condition may be off where the state is so by its tolerances."""
+    slopes = jax.grad(lambda y: jnp.asarray(condition(t, y, args), t.dtype))(y)
+    errors = jax.tree.map(lambda slope, x: jnp.sum(jnp.abs(slope) * (rtol * jnp.abs(x) + atol)), slopes, y)
+    return sum(jax.tree.leaves(errors), jnp.zeros_like(t))

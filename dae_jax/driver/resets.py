@@ -18,12 +18,12 @@ from ..compiler.types import Arrays
 from ..consistent import consistent_state
 from ..solution import RESULTS, DAESolution, Split, precision_of
 from ..systems import System
-from ..types import Args, Scalar, State, Time
+from ..types import Args, BoolScalar, Scalar, State, Time
 from ..validate.states import NUMBERS, brief
 from .bracket import Bracket
 from .ends import Start
 from .problem import Problem, count_of, split
-from .reset_levels import FromStart, level_at_start
+from .reset_levels import FromStart, error_of, level_at_start
 from .start import saved_parts
 
 
@@ -55,7 +55,10 @@ class Reset(eqx.Module):
     after it. `sol.stats["jumps"]` counts them, `sol.stats["jump_times"]` are their times, padded with infinity. As any
     event, it is found where the condition has different signs at the two ends of a step: two crossings in one step are
     none. A condition that is 0 at the start, or will be within 3e-11 of the larger of |t0| and |t1|, is on the side that it moves
-    to; of a time to save at that is that of a reset but for round-off, the state is that before or after it.
+    to, from rest too; where it stays at 0 for a while, that is only known where a `direction` is given, and without one the solve
+    fails with `RESULTS.undetermined_side`. What a reset has brought to rest and is pulled through zero again is reset again: it fails
+    with `RESULTS.too_many_jumps`. Of a time to save at that is that of a reset but for round-off, the state is that before or
+    after it.
     """
 
     condition: Callable[..., Any]
@@ -93,8 +96,8 @@ def Jump(
 
 class _Progress(NamedTuple):
     """Where a solve stands: the start of the next part, what was saved so far, `changed` of the args beside, and how the last part
-    ended; `level` is the condition at the start of the last part, `moved` by how much making the state after the last reset consistent
-    has changed it.
+    ended; `side` is the sign that the condition had in the last part, `changed_y` whether the last reset changed the state, `found` the
+    condition there, `moved` by how much making the state after that consistent has changed it.
     """
 
     t: Float[Array, ""]
@@ -107,7 +110,9 @@ class _Progress(NamedTuple):
     changed: list[Array]
     stats: Any
     code: Int[Array, ""]
-    level: Float[Array, ""]
+    side: Float[Array, ""]
+    changed_y: Float[Array, ""]
+    found: Float[Array, ""]
     moved: Float[Array, ""]
 
 
@@ -138,18 +143,20 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Start]
     # In which the order of resets is round-off.
     together = 16 * float(jnp.finfo(t0.dtype).eps) ** 0.75 * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
     tolerances = [jnp.max(jnp.asarray(getattr(solve.controller, x, 0.0), t0.dtype)) for x in ("rtol", "atol")]
+    unknown = jnp.zeros_like(t0)
     going = int(RESULTS.event_occurred._value)
 
     def part(p: _Progress) -> tuple[DAESolution, Any]:
         args = eqx.combine(p.args, others)
         level, off, near = level_at_start(
-            system, reset.condition, sign, p.t, p.y, args, p.level, rank, together, p.moved, *tolerances
-        )
+            system, reset.condition, sign, p.t, p.y, args, p.side, p.changed_y, rank, together, p.found, p.moved,
+            *tolerances,
+        )  # fmt: skip
         near = jnp.minimum(near, SAME * jnp.abs(t1 - t0))
         # A downcrossing, as bisection has to know which way it goes.
-        up = {True: -1, False: 1, None: jnp.sign(level)}[reset.direction]
+        side = jnp.asarray({True: -1, False: 1, None: jnp.sign(level)}[reset.direction], t0.dtype)
         event = diffrax.Event(
-            FromStart(reset.condition, jnp.asarray(up, t0.dtype), p.t, level, off, near),
+            FromStart(reset.condition, side, p.t, level, off, near),
             Bracket(0.0, 0.0, flip=True),
             direction=False,
         )
@@ -158,10 +165,10 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Start]
         subs = {"wanted": dataclasses.replace(output, t0=False, t1=False, ts=later), "end": diffrax.SubSaveAt(t1=True)}
         one = dataclasses.replace(solve, event=event, saveat=diffrax.SaveAt(subs=subs))
         sol, _ = one(dataclasses.replace(problem, t0=p.t, y0=p.y, args=args))
-        return dataclasses.replace(sol, given=None), level
+        return dataclasses.replace(sol, given=None), side
 
     def advance(p: _Progress) -> _Progress:
-        sol, level = part(p)
+        sol, side = part(p)
         end, reached = sol.ts["end"][-1], jax.tree.map(lambda y: y[-1], sol.ys["end"])
         here = (sign * wanted >= sign * p.t) & (sign * wanted <= sign * end)
         ts = jnp.where(here, wanted, p.ts)
@@ -173,21 +180,23 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Start]
         code = sol.result._value
         piled = (p.count > 0) & (sign * (end - p.t) <= together)
         jumps, exhausted = code == going, piled | (p.count >= reset.max_resets)
-        y, after, moved = lax.cond(
+        y, after, *of_reset = lax.cond(
             jumps & ~exhausted,
             lambda: _after(system, reset, end, reached, eqx.combine(p.args, others)),
-            lambda: (jax.tree.map(jnp.asarray, reached), p.args, jnp.zeros_like(p.moved)),
+            lambda: (jax.tree.map(jnp.asarray, reached), p.args, unknown, unknown, unknown),
         )
         times = jnp.where((jnp.arange(reset.max_resets) == p.count) & jumps & ~exhausted, end, p.times)
         code = jnp.where(jumps & exhausted, RESULTS.too_many_jumps._value, code)
+        if reset.direction is None:
+            lost = (side == 0) & _differs(reset.condition, end, reached, eqx.combine(p.args, others), *tolerances)
+            code = jnp.where(lost & (code == RESULTS.successful._value), RESULTS.undetermined_side._value, code)
         return _Progress(
-            end, y, after, p.count + (jumps & ~exhausted), times, ts, ys, changed, stats, code, level, moved
+            end, y, after, p.count + (jumps & ~exhausted), times, ts, ys, changed, stats, code, side, *of_reset
         )
 
-    unknown = jnp.zeros_like(t0)
     none: Any = None
     shape = jax.eval_shape(
-        part, _Progress(t0, y0, numbers, none, none, none, none, none, none, none, unknown, unknown)
+        part, _Progress(t0, y0, numbers, none, none, none, none, none, none, none, unknown, unknown, unknown, unknown)
     )[0]
     unsaved = jax.tree.map(lambda x: jnp.full(x.shape, jnp.inf, x.dtype), shape.ys["wanted"])
     stats = {k: jnp.zeros((), int) for k in shape.stats if k not in NO_COUNTS}
@@ -196,7 +205,7 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Start]
     start = _Progress(
         t0, y0, numbers, jnp.zeros((), int), jnp.full(reset.max_resets, jnp.inf, t0.dtype),
         jnp.full_like(wanted, jnp.inf), unsaved, given, stats, jnp.asarray(going, RESULTS.successful._value.dtype), unknown,
-        unknown,
+        unknown, unknown, unknown,
     )  # fmt: skip
     kind: Any = "checkpointed" if solve.derivative() == "reverse" else "lax"
     max_steps = reset.max_resets + 1 if kind == "checkpointed" else None
@@ -219,6 +228,12 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Start]
     return sol, Start(jnp.where(fine, 0, 1), fine)
 
 
+def _differs(condition: Callable[..., Any], t: Time, y: State, args: Args, rtol: Scalar, atol: Scalar) -> BoolScalar:
+    """Whether the condition is not zero, by more than the state may be off."""
+    t = jnp.asarray(t)
+    return jnp.abs(condition(t, y, args)) > error_of(condition, t, y, args, rtol, atol)
+
+
 def _is_number(x: object) -> bool:
     return isinstance(x, NUMBERS)
 
@@ -235,11 +250,15 @@ def _changes(reset: Reset, t: Time, y: State, args: Args) -> PyTree[bool]:
     return found[0]
 
 
-def _after(system: System, reset: Reset, t: Time, y: State, args: Args) -> tuple[Any, Any, Scalar]:
-    """The state and the numbers in the args after a reset, and by how much the condition has moved with the state that is consistent."""
+def _after(system: System, reset: Reset, t: Time, y: State, args: Args) -> tuple[Any, Any, Scalar, Scalar, Scalar]:
+    """The state and the numbers in the args after a reset; whether the state is another; the condition before it, which is zero but for
+    the resolution of time, and by how much it has moved with the state that is consistent.
+    """
     wanted, new = reset.reset(t, y, args)
-    y = consistent_state(system, t, wanted, new, fixed=reset.fixed)
-    moved = jnp.abs(reset.condition(t, y, new) - reset.condition(t, wanted, new))
+    consistent = consistent_state(system, t, wanted, new, fixed=reset.fixed)
+    of = lambda y, args: jnp.asarray(reset.condition(t, y, args), jnp.result_type(t))
     numbers = (eqx.filter(a, _is_number) for a in (new, args))
     after = jax.tree.map(lambda x, like: jnp.asarray(x, jnp.result_type(like)), *numbers)
-    return y, after, lax.stop_gradient(jnp.asarray(moved, jnp.result_type(t)))
+    found, moved = lax.stop_gradient((jnp.abs(of(y, args)), jnp.abs(of(consistent, new) - of(wanted, new))))
+    other = jnp.any(jnp.stack([jnp.any(a != b) for a, b in zip(*map(jax.tree.leaves, (wanted, y)), strict=True)]))
+    return consistent, after, other.astype(found.dtype), found, moved
