@@ -18,9 +18,9 @@ from .equations.nearest_point import nearest_point
 from .equations.regularity import ALONG, mass_is_regular, mass_message
 from .equations.residual_form import ResidualForm, weighted
 from .equations.structural_ode import StructuralODE
-from .linalg import fixed_point, implicit_root, relative_change
+from .linalg import fixed_point, implicit_root, relative_change, take
 from .systems import ConstrainedSystem, System, is_mechanism
-from .types import Args, Phase, State, Time
+from .types import Args, Flat, Phase, State, Time
 from .validate.captured import current
 from .validate.closures import opened
 from .validate.states import as_floats, broadcast_to_state, refuse_not_finite, refuse_wrong_state, with_rates
@@ -78,13 +78,13 @@ def _of_entries(x: Float[Array, " n"]) -> Float[Array, " n"]:
 
 class Unsolved(eqx.Module):
     """What is left of the equations and the hidden ones for the best derivatives, and how much of it counts as round-off
-    of the user's numbers; at the end of a solve, where large variables may cross zero, all variables are taken to be as large as the
-    largest: `near_end`. Whether `several` derivatives satisfy the equations.
+    of the user's numbers; how large it is for variables as they were `on_the_way` here, as one that is large may just cross zero.
+    Whether `several` derivatives satisfy the equations.
     """
 
     residuals: Float[Array, " m"]
     allowed: Float[Array, " m"]
-    near_end: Float[Array, " m"]
+    on_the_way: Float[Array, " m"]
     equations: tuple[str, ...] = eqx.field(static=True)
     several: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(False))
 
@@ -93,9 +93,9 @@ class Unsolved(eqx.Module):
         return jnp.all(jnp.abs(self.residuals) <= self.allowed)
 
     def as_part(self) -> Float[Array, ""]:
-        """By which part of the state at the end of a solve the worst equation is off."""
-        off = jnp.abs(self.residuals) / jnp.where(self.near_end > 0, self.near_end, 1)
-        return jnp.finfo(off.dtype).eps ** 0.5 * jnp.max(off, initial=0)
+        """By which part of the state on the way here the worst equation is off, round-off aside."""
+        off = jnp.abs(self.residuals) - self.allowed
+        return jnp.max(off / jnp.where(self.on_the_way > 0, self.on_the_way, 1), initial=0)
 
     def message(self) -> str:
         """Which equations are off, and by how much."""
@@ -109,32 +109,40 @@ class Unsolved(eqx.Module):
         return "The initial state `y0` violates the equations, whatever its derivatives:\n" + "\n".join(lines)
 
 
-def unsolved(system: System, t: Time, state: State, args: Args) -> Unsolved:
-    """What no derivatives of a state make vanish of the equations of a system that is no mechanism."""
+def unsolved(system: System, t: Time, state: State, args: Args, way: tuple[State, Time] | None = None) -> Unsolved:
+    """What no derivatives of a state make vanish of the equations of a system that is no mechanism. `way`: the state at the start of
+    the solve that has led here, and how long it was.
+    """
     form = ResidualForm.of(system, t, state, args)
     y = form.encode(state)
     t = jnp.asarray(t, y.dtype)
+    start, span = (y, jnp.zeros_like(t)) if way is None else (form.encode(way[0]), way[1])
     linearised = LinearisedResidual.of(form, y)
     if linearised.structure.hidden:
         ode = StructuralODE.of(form, y.dtype, complete=True)
-        return _left_over(ode, t, ode.encode(t, state))
+        return _left_over(ode, t, ode.encode(t, state), start, span)
     several = rates_of(form, t, y)[1] if is_nonlinear(form, y.dtype) else jnp.asarray(False)
     yd = linearised.rates(t, y)
     j, m = linearised.jacobians(t, y, yd)
     apply, root = linearised.storage.apply, jnp.finfo(y.dtype).eps ** 0.5
-    j, m = jnp.abs(j), jnp.abs(m)
-    own, largest = (root * (apply(j, of(y)) + apply(m, of(yd))) for of in (_of_entries, _of_largest))
-    return Unsolved(linearised.residual(t, y, yd), own, largest, form.equations, several)
+    largest = _on_the_way(y, start, yd, span)
+    sizes = lambda x, xd: apply(jnp.abs(j), x) + apply(jnp.abs(m), xd)
+    own, on_the_way = sizes(_of_entries(y), _of_entries(yd)), sizes(1 + largest, 1 + jnp.abs(yd))
+    return Unsolved(linearised.residual(t, y, yd), root * own, on_the_way, form.equations, several)
 
 
-def _left_over(ode: StructuralODE, t: Time, y: Float[Array, " N"]) -> Unsolved:
+def _left_over(ode: StructuralODE, t: Time, y: Float[Array, " N"], start: Flat, span: Time) -> Unsolved:
     root = jnp.finfo(y.dtype).eps ** 0.5
-    own, largest = ode.sizes(t, y, (_of_entries(y), _of_largest(y)))
-    return Unsolved(ode.violations(t, y), root * own, root * largest, ode.invariant_names)
+    # Derivatives of the highest order are not in the state.
+    rates = take(jnp.concatenate([y, jnp.zeros_like(start)]), ode.orders.derivatives)
+    largest = _on_the_way(y, take(start, ode.orders.values), rates, span)
+    own, on_the_way = ode.sizes(t, y, (_of_entries(y), 1 + largest))
+    return Unsolved(ode.violations(t, y), root * own, on_the_way, ode.invariant_names)
 
 
-def _of_largest(x: Float[Array, " n"]) -> Float[Array, " n"]:
-    return jnp.full_like(x, 1 + jnp.max(jnp.abs(x)))
+def _on_the_way(y: Flat, start: Flat, rates: Flat, span: Time) -> Flat:
+    """How large each variable has been on the way from `start`, as far as its ends show; over a second, where that is long."""
+    return jnp.maximum(jnp.maximum(jnp.abs(y), jnp.abs(start)), jnp.minimum(span, 1) * jnp.abs(rates))
 
 
 @at_ease
@@ -208,7 +216,7 @@ def _nearest_of_any(system: System, t: Time, y0: State, args: Args, masks: State
     ode = StructuralODE.of(form, values.dtype, complete=True)
     freedom = jnp.where(form.encode(masks), 0, 1)
     y = ode.start(t, values, freedom, None if rates is None else form.encode(rates))
-    remains = _left_over(ode, t, y)
+    remains = _left_over(ode, t, y, values, jnp.zeros_like(t))
     fine = remains.consistent()
     return jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), ode.decode(t, y)), fine, remains
 

@@ -148,10 +148,10 @@ class LinearisedResidual(eqx.Module):
         matrix = jax.lax.stop_gradient(j + c * m)
         return Probe.of(functools.partial(self.storage.apply, matrix), functools.partial(self.solve, factors), scale)
 
-    def round_off(self, j: Array, m: Array, c: Inexact[Array, ""], size: Float[Array, " n"]) -> Float[Array, " n"]:
-        """The round-off of each of the combined equations, (|J| + |c M|) ε, for variables of that `size`."""
+    def terms(self, j: Array, m: Array, c: Inexact[Array, ""], size: Float[Array, " n"]) -> Float[Array, " n"]:
+        """How large the terms of each of the combined equations are together, (|J| + |c M|) |x|, for variables of that `size`."""
         terms = self.storage.apply(jnp.abs(j) + jnp.abs(c * m), size)
-        return _combined(self.structure.combination.of_sizes, terms, jnp.abs(c)) * jnp.finfo(size.dtype).eps
+        return _combined(self.structure.combination.of_sizes, terms, jnp.abs(c))
 
     def column_scale(self, h: Time) -> Float[Array, " n"]:
         """h^dⱼ, or 1 where the storage takes the unknowns as they are."""

@@ -102,10 +102,11 @@ class _State(NamedTuple):
 
 
 class _Factors(NamedTuple):
-    """The factors of the iteration `matrix`, what may be `round_off` of each equation, and its `probe`."""
+    """The factors of the iteration `matrix`, what may be `round_off` of each equation, what is `enough`, and its `probe`."""
 
     matrix: Any
     round_off: Float[Array, " n"]
+    enough: Float[Array, " n"]
     probe: Any
 
 
@@ -129,7 +130,8 @@ class _Step(NamedTuple):
         j, m = self.linearised.jacobians(self.sign * self.t1, y, self.sign * (self.rate + self.c * (y - self.y)))
         factors = self.linearised.factor(j, m, self.sign * self.c, self.h)
         round_off = tol.round_off(self.linearised, j, m, self.c, self.y)
-        return _Factors(factors, round_off, self.linearised.probe(j, m, factors))
+        enough = tol.enough(self.linearised, j, m, self.c, self.y)
+        return _Factors(factors, round_off, enough, self.linearised.probe(j, m, factors))
 
 
 class BDF(Replayable, AbstractResidualSolver):
@@ -378,7 +380,7 @@ def _solve(step: _Step, y0: Any, state: _State, smallest: Any, tol: Tolerances) 
         factors = lax.cond(renew, new, lambda: factors)
         correction = lambda residual: -step.linearised.solve(factors.matrix, residual)
         combined = lambda rows: step.linearised.combined(rows, step.c)
-        iteration = Iteration(step.residual, correction, combined, factors.round_off)
+        iteration = Iteration(step.residual, correction, combined, factors.round_off, factors.enough)
         scale = lambda y: weights / tol.scale(y0, y)
         eta = jnp.where(renew, 1, state.eta)
         # Here, since each function would have it.

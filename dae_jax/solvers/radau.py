@@ -313,7 +313,7 @@ def _solve(step: Step, state: RadauState, tol: Tolerances) -> Any:
         factors = lax.cond(refactor, lambda: step.factor(jacobians, tol), lambda: factors)
         correction = lambda residuals: step.correction(factors, residuals)
         combined = lambda rows: jnp.stack([step.linearised.combined(row, 1 / h) for row in rows])
-        iteration = Iteration(step.residuals, correction, combined, factors.round_off)
+        iteration = Iteration(step.residuals, correction, combined, factors.round_off, factors.enough)
         scale = lambda z: weights / tol.scale(step.y0, step.y0 + z[-1])
         # Here, since each function would have it.
         off = iteration.residual(start)

@@ -61,11 +61,12 @@ def _looped(fn: Callable[[Any], Any], items: list[Any]) -> list[Any]:
 
 
 class Factors(NamedTuple):
-    """The factors of the `real` and the `complex` iteration matrices, and what may be `round_off` of each equation."""
+    """The factors of the `real` and the `complex` iteration matrices, what may be `round_off` of each equation and what is `enough`."""
 
     real: Any
     complex: tuple[Any, ...]
     round_off: Float[Array, " n"]
+    enough: Float[Array, " n"]
     probe: Any
 
 
@@ -131,7 +132,8 @@ class Step(NamedTuple):
         # The elimination is the larger part of what there is to compile.
         both = map(eliminated, pairs) if len(pairs) == 1 else _looped(eliminated, pairs)
         round_off = tol.round_off(self.linearised, j, m, 1 / self.h, self.y0)
-        return Factors(real, tuple(both), round_off, self.linearised.probe(j, m, real))
+        enough = tol.enough(self.linearised, j, m, 1 / self.h, self.y0)
+        return Factors(real, tuple(both), round_off, enough, self.linearised.probe(j, m, real))
 
     def determines(self, factors: Factors, z: Float[Array, "s n"]) -> Bool[Array, ""]:
         """Whether the matrix that was factorised serves to solve the equations at the end of the step."""

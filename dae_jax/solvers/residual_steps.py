@@ -131,7 +131,11 @@ class Tolerances(NamedTuple):
 
     def round_off(self, linearised: Any, j: Any, m: Any, c: Any, y: Float[Array, " n"]) -> Float[Array, " n"]:
         """What each equation may be off by for certain, where the iteration matrix is J + c M."""
-        return OFF * linearised.round_off(j, m, c, jnp.abs(y) + self.atol)
+        return OFF * jnp.finfo(y.dtype).eps * linearised.terms(j, m, c, jnp.abs(y) + self.atol)
+
+    def enough(self, linearised: Any, j: Any, m: Any, c: Any, y: Float[Array, " n"]) -> Float[Array, " n"]:
+        """What each equation may be off by at most: what the errors that are allowed in its variables amount to."""
+        return NOISE * linearised.terms(j, m, c, self.scale(y))
 
     def norm(self, error: Any, *ys: Any) -> Float[Array, ""]:
         """The size of an error; 1 is allowed."""
@@ -147,7 +151,7 @@ def tolerances(rtol: Any, atol: Any, dtype: Any) -> Tolerances:
     patient = rtol is None
     rtol, atol = (epsilon ** (2 / 3) if x is None else x for x in (rtol, atol))
     largest = jnp.maximum(jnp.max(jnp.asarray(rtol, dtype)), epsilon)
-    newton = jnp.maximum(10 * epsilon / largest, jnp.minimum(0.03, jnp.sqrt(largest)))
+    newton = jnp.maximum(epsilon / largest, jnp.minimum(0.03, jnp.sqrt(largest)))
     roundoff = jnp.maximum(100 * epsilon / largest, newton / 10)
     return Tolerances(
         *lax.stop_gradient((jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype), newton, roundoff)),
@@ -180,22 +184,24 @@ def not_begun(start: Any, eta: Any) -> Newton:
 
 class Iteration(NamedTuple):
     """F(x), the solution of A Δx = −F for the iteration matrix A at hand, and F `combined` so that each equation says something
-    of its own where highest derivatives cancel between them; what of these may be `round_off`.
+    of its own where highest derivatives cancel between them; what of these may be `round_off`, and what is `enough`.
     """
 
     residual: Callable[[Any], Any]
     correction: Callable[[Any], Any]
     combined: Callable[[Any], Any]
     round_off: Any
+    enough: Any
 
     def after(self, x: Any, dx: Any, before: Any, allowed: Any = LEFT) -> tuple[Any, Any]:
         """F at x, and whether the size of the correction Δx that led there says how far the solution is: by a matrix from
         where F was steep it is small wherever that is. Each equation has to be one that about as much more of Δx puts right,
-        by its slope at x or by what Δx has changed of F `before` (at most `allowed` of it), or right to round-off.
+        by its slope at x or by what Δx has changed of F `before` (at most `allowed` of it), or right to round-off; and by no more
+        than is `enough`: that a velocity's error counts h of it says nothing of the part that no constraint determines.
         """
         left, change = jax.jvp(self.residual, (x,), (dx,))
         rows, changes, changed = map(self.combined, (left, change, left - before))
-        moved = allowed * jnp.maximum(jnp.abs(changes), jnp.abs(changed))
+        moved = jnp.minimum(allowed * jnp.maximum(jnp.abs(changes), jnp.abs(changed)), self.enough)
         return left, jnp.all(jnp.abs(rows) <= jnp.maximum(moved, self.round_off))
 
 
@@ -229,9 +235,10 @@ def simplified_newton(
         remaining = tol.corrections - 1 - s.count
         stagnant = ~first & (theta >= 1)
         hopeless = stagnant | (eta * step * theta**remaining > tol.newton) & (step > NOISE)
-        # A correction that does not shrink any more but is small is round-off.
         known = ~stagnant if pace is None else ~stagnant & ~first
-        small = (eta * size <= tol.newton) & known | (size <= tol.roundoff) | (stagnant & (size <= NOISE))
+        # Only one that does not shrink any more is round-off: what is left of a position comes back divided by h in its velocity.
+        noise = stagnant & (size <= jnp.maximum(tol.roundoff, NOISE))
+        small = (eta * size <= tol.newton) & known | (size <= tol.newton / 10) | noise
         converged = small & trusted
         diverged = ~jnp.isfinite(size) | (~first & hopeless & ~converged & ~jnp.asarray(tol.patient))
         theta = jnp.where(first, 0, theta)

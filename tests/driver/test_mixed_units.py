@@ -69,6 +69,31 @@ def test_drift_beside_a_large_coordinate(orbit):
     assert float(dae_jax.drift(system, sol).position[-1]) > 0.1
 
 
+@pytest.mark.parametrize("large", [1.0, 1e6, 1e9])
+def test_drift_of_a_dae_beside_a_large_unknown(large):
+    def circling(t, y, yd, args):
+        x, v, force, count = y[:2], y[2:4], y[4], y[5]
+        return jnp.concatenate([yd[:2] - v, yd[2:4] + force * x, jnp.stack([x @ x - 1, yd[5] + 1e-9 * count])])
+
+    system, start = ImplicitDAE(circling), jnp.array([1.0, 0.0, 0.0, 1.0, 1.0, large])
+    with pytest.warns(AccuracyWarning, match="drift"):
+        sol = dae_jax.daesolve(system, diffrax.Euler(), 0.0, 5.0, 0.1, start)
+    assert float(dae_jax.drift(system, sol).levels[0][-1]) > 0.5
+
+
+@pytest.mark.parametrize("solver", [diffrax.Tsit5(), OrthogonalProjection(diffrax.Tsit5())], ids=["drifts", "keeps"])
+def test_what_is_large_and_crosses_zero_has_not_drifted(solver):
+    """x = 10⁶ sin t: at both ends 0."""
+
+    def swinging(t, y, yd, args):
+        x, v, _ = y
+        return jnp.stack([yd[0] - v, x - 1e6 * jnp.sin(t), yd[2] - 1e-6 * x])
+
+    system, start = ImplicitDAE(swinging), jnp.array([0.0, 1e6, 0.0])
+    sol = dae_jax.daesolve(system, solver, 0.0, 2 * jnp.pi, None, start)
+    assert int(sol.stats["doubts"]) == 0
+
+
 @pytest.mark.parametrize("amplitude", [0.0, 1e7])
 @pytest.mark.parametrize(
     "solver", [OrthogonalProjection(dae_jax.DOP853()), dae_jax.RadauIIA5()], ids=["explicit", "GGL"]

@@ -93,7 +93,7 @@ def test_no_value_is_between_the_two_sides_of_a_jump(solver, announced):
 def test_one_correction_does_not_count_as_a_solution_because_the_step_before_converged_fast():
     tol = tolerances(1e-6, 1e-6, jnp.float64)._replace(corrections=50)
     # The matrix is of another regime: half the error is left by each correction.
-    half_way = Iteration(lambda x: x - 1, lambda off: -off / 2, lambda off: off, jnp.zeros(1))
+    half_way = Iteration(lambda x: x - 1, lambda off: -off / 2, lambda off: off, jnp.zeros(1), jnp.inf)
     start = jnp.array([1e-3])
     found = simplified_newton(
         half_way, start, half_way.residual(start), 1 / tol.scale(jnp.ones(1)), jnp.asarray(1e-12), tol
