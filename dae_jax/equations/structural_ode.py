@@ -219,6 +219,10 @@ class StructuralODE(ManifoldODE):
         """X, the derivatives of order Dⱼ."""
         return self.tearing.solve(*self._system(t, y, feedback))
 
+    def leading(self, t: Time, y: Float[Array, " N"]) -> Float[Array, "n n"]:
+        """The matrix of the equations for X, without a derivative."""
+        return lax.stop_gradient(self._system(t, y, None)[0])
+
     @property
     def oriented(self) -> list[Block]:
         """The varying blocks of the matrix of the equations for X, but for large ones."""
@@ -229,7 +233,7 @@ class StructuralODE(ManifoldODE):
         """Whether the equations for X determine all of it, to round-off, and of the determinant of each `oriented` block the sign and
         log |det|.
         """
-        matrix = lax.stop_gradient(self._system(t, y, None)[0])
+        matrix = self.leading(t, y)
         apply = lambda x: jnp.sum(matrix * x, 1)
         probe = Probe.of(apply, lambda b: self.tearing.solve(matrix, b), jnp.ones(self.form.size, y.dtype))
         found = [jnp.stack(signed_log_determinant(matrix[np.ix_(*block)])) for block in self.oriented]
@@ -333,55 +337,52 @@ class StructuralODE(ManifoldODE):
 
     def selection(
         self,
-        t: Time,
-        y: Float[Array, " N"],
-        chosen: Float[Array, "m N"] | None,
-        ahead: tuple[Time, Float[Array, " N"]] | None = None,
+        leading: Float[Array, "n n"],
+        chosen: Float[Array, "m N"] | None = None,
+        ahead: Float[Array, "n n"] | None = None,
     ) -> tuple[Float[Array, "m N"], Bool[Array, ""]]:
         """Unit directions of the dummy derivatives, entries of Y that H = 0 determines given the others, and whether they
         are not `chosen`.
 
         Level by level, from the highest: the equations with Cᵢ ≥ k determine the derivatives of order Dⱼ − k of as many
-        variables, taken by complete pivoting on the system Jacobian from those that the level before has taken; on entries that
-        change little in a step to the point `ahead` first.
+        variables, taken by complete pivoting on the `leading` matrix from those that the level before has taken; on entries
+        first that are about the same in that `ahead`, a step later.
         """
         d = np.array(self.orders.variables)
-        matrix = lax.stop_gradient(self._system(t, y, None)[0])
-        largest = jnp.max(jnp.abs(matrix), 1, keepdims=True)
-        if ahead is not None and self.varying:
-            matrix = _lasting(matrix, lax.stop_gradient(self._system(*ahead, None)[0]))
+        largest = jnp.max(jnp.abs(leading), 1, keepdims=True)
+        matrix = leading if ahead is None else _lasting(leading, ahead)
         matrix = matrix / jnp.where(largest > 0, largest, 1)
-        infinite = jnp.asarray(jnp.inf, y.dtype)
-        available, quality, present, first, directions = jnp.ones(len(d), y.dtype), infinite, infinite, 0, []
+        infinite = jnp.asarray(jnp.inf, matrix.dtype)
+        available, quality, present, first, directions = jnp.ones(len(d), matrix.dtype), infinite, infinite, 0, []
         for k in range(1, max(self.orders.equations) + 1):
             rows = self.orders.rows(k - 1)
             place = self.orders.dummies(k)
             level = jnp.stack([matrix[i] for i in rows]) * (d >= k)
             taken, smallest = _pivots(level * available)
             quality, available = jnp.minimum(quality, smallest), jnp.sum(taken, 0)
-            embedding = np.zeros((len(d), y.size))
+            embedding = np.zeros((len(d), self.orders.size))
             embedding[place >= 0, place[place >= 0]] = 1
             directions.append(jnp.sum(taken[:, :, None] * jnp.asarray(embedding, taken.dtype), 1))
             if chosen is not None:
                 _, smallest = _pivots(level * take(jnp.sum(chosen[first : first + len(rows)], 0), place))
                 present = jnp.minimum(present, smallest)
             first += len(rows)
-        best = jnp.concatenate(directions) if directions else jnp.zeros((0, y.size), y.dtype)
+        best = jnp.concatenate(directions) if directions else jnp.zeros((0, self.orders.size), matrix.dtype)
         if chosen is None or not directions:
             return best, jnp.asarray(False)
         keep = present >= HYSTERESIS * quality
         return jnp.where(keep, chosen, best), ~keep
 
-    def orientation(self, t: Time, y: Float[Array, " N"], chosen: Float[Array, "m N"]) -> Float[Array, " levels"]:
+    def orientation(self, leading: Float[Array, "n n"], chosen: Float[Array, "m N"]) -> Float[Array, " levels"]:
         """The sign, level by level, of the determinant with which H = 0 determines the `chosen` dummy derivatives: it changes
         only where these become undetermined.
         """
-        matrix, first, signs = lax.stop_gradient(self._system(t, y, None)[0]), 0, []
+        first, signs = 0, []
         for k in range(1, max(self.orders.equations) + 1):
             rows, place = self.orders.rows(k - 1), self.orders.dummies(k)
             directions = chosen[first : first + len(rows)]
             columns = jnp.where(jnp.asarray(place >= 0), directions[:, np.maximum(place, 0)], 0)
-            signs.append(determinant_sign(row_products(matrix[rows], columns)))
+            signs.append(determinant_sign(row_products(leading[rows], columns)))
             first += len(rows)
         return jnp.stack(signs)
 

@@ -72,7 +72,7 @@ class ReducedResidual(AbstractResidualFormulation):
         self, system: System, t: Time, state: State, args: Args = None, rank: int | Rank | None = None
     ) -> tuple[Any, LinearisedResidual]:
         y, ode = DummyDerivatives().encode(system, t, state, args, rank)
-        form = Index1Form(ode, ode.selection(t, y, None)[0])
+        form = Index1Form(ode, ode.selection(ode.leading(t, y))[0])
         z = form.encode(t, y)
         # The selection changes: the structure is that of all of them.
         linearised = LinearisedResidual.of(form.with_all_candidates(y.dtype), z)

@@ -35,6 +35,21 @@ class Selection(NamedTuple):
     switches: Any
 
 
+def _selected(
+    ode: StructuralODE, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, rates: Any, chosen: Any
+) -> tuple[Any, Any, Any]:
+    """The directions for the step from t₀ to t₁, whether they are not those `chosen` before, and the leading matrix at its start."""
+    sign = time_sign(terms, t0, t1)
+    start = ode.leading(sign * t0, y0)
+    ahead = ode.leading(sign * t1, y0 + terms.contr(t0, t1) * rates) if ode.varying else start
+    return *ode.selection(start, chosen, ahead), start
+
+
+def _stays(ode: StructuralODE, directions: Any, start: Any, end: Any) -> Any:
+    """Whether the others determine the dummy derivatives all the way between these leading matrices."""
+    return jnp.all(ode.orientation(start, directions) * ode.orientation(end, directions) > 0)
+
+
 class SelectedStates(Replayable, AbstractChartSolver):
     """A step of an explicit solver in some entries of the state, its *states*; the others, as many as there are
     constraints, are found from H(t, y) = 0 by Newton's method at each stage. Used by `DummyDerivatives`, which see.
@@ -50,7 +65,7 @@ class SelectedStates(Replayable, AbstractChartSolver):
     counts: ClassVar[tuple[str, ...]] = ("switches",)
 
     def init(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any) -> Selection:
-        directions, _ = args.selection(time_sign(terms, t0, t1) * t0, y0, None)
+        directions, _ = args.selection(args.leading(time_sign(terms, t0, t1) * t0, y0))
         return Selection(terms.vf(t0, y0, args), directions, jnp.asarray(0))
 
     def step(
@@ -64,14 +79,12 @@ class SelectedStates(Replayable, AbstractChartSolver):
         made_jump: BoolLike,
     ) -> Any:
         sign = time_sign(terms, t0, t1)
-        ahead = y0 + terms.contr(t0, t1) * solver_state.inner
-        directions, switched = args.selection(sign * t0, y0, solver_state.directions, (sign * t1, ahead))
+        directions, switched, start = _selected(args, terms, t0, t1, y0, solver_state.inner, solver_state.directions)
         y1, error, dense, derivative, result = self.step_in(
             directions, terms, t0, t1, y0, args, solver_state.inner, made_jump
         )
         if len(directions):
-            before, after = args.orientation(sign * t0, y0, directions), args.orientation(sign * t1, y1, directions)
-            stays = jnp.all(before * after > 0)
+            stays = _stays(args, directions, start, args.leading(sign * t1, y1))
             if self.dense:
                 stays &= self._is_found_within(sign, t0, t1, dense, args)
             if error is not None:
@@ -168,21 +181,18 @@ class SelectedResiduals(Replayable, AbstractResidualSolver):
         made_jump: BoolLike,
     ) -> Any:
         ode, sign = args.form.ode, time_sign(terms, t0, t1)
-        y, rates = (x[: args.form.ode.orders.size] for x in (y0, args.form.known_rates(y0)))
-        ahead = y + terms.contr(t0, t1) * rates
-        directions, switched = ode.selection(sign * t0, y, solver_state.directions, (sign * t1, ahead))
+        y, rates = (x[: ode.orders.size] for x in (y0, args.form.known_rates(y0)))
+        directions, switched, start = _selected(ode, terms, t0, t1, y, rates, solver_state.directions)
         solver = dataclasses.replace(self.solver, rtol=self.rtol, atol=self.atol)
         state = jax.tree.map(
             lambda a, b: jnp.where(switched, a, b), self.invalidate_jacobian(solver_state), solver_state
         )
         y1, error, dense, inner, result = solver.step(
-            terms, t0, t1, y0, _selected(args, directions), state.inner, made_jump
+            terms, t0, t1, y0, _with_dummies(args, directions), state.inner, made_jump
         )
         dense = {"inner": dense, "directions": directions}
         if len(directions):
-            there = y1[: ode.orders.size]
-            before, after = ode.orientation(sign * t0, y, directions), ode.orientation(sign * t1, there, directions)
-            stays = jnp.all(before * after > 0)
+            stays = _stays(ode, directions, start, ode.leading(sign * t1, y1[: ode.orders.size]))
             y1, error = or_nan(stays, y1), or_nan(stays, error)
             result = diffrax.RESULTS.where(stays, result, outcome(stays))
         return y1, error, dense, Selection(inner, directions, solver_state.switches + switched), result
@@ -199,11 +209,11 @@ class SelectedResiduals(Replayable, AbstractResidualSolver):
         self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any, history: Any, dense: Any
     ) -> Any:
         solver: Any = self.solver
-        linearised = _selected(args, dense["directions"])
+        linearised = _with_dummies(args, dense["directions"])
         y1, history, inner = solver.replay(terms, t0, t1, y0, linearised, history, dense["inner"])
         return y1, history, {**dense, "inner": inner}
 
 
-def _selected(args: Any, directions: Any) -> Any:
+def _with_dummies(args: Any, directions: Any) -> Any:
     """The linearised `Index1Form` with these entries as algebraic variables."""
     return eqx.tree_at(lambda p: p.form.directions, args, directions)
