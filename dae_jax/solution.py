@@ -156,7 +156,7 @@ class Interpolation(eqx.Module):
     """The solution at any time, in the user's structure, on the manifold where the method keeps its steps there."""
 
     path: diffrax.DenseInterpolation
-    # `decode(t, y, ode)`, and its `ode`.
+    # What makes states of points, and its `ode`.
     view: Split
 
     @classmethod
@@ -169,7 +169,7 @@ class Interpolation(eqx.Module):
         if t1 is not None:
             return jax.tree.map(lambda a, b: b - a, self.evaluate(t0, left=left), self.evaluate(t1, left=left))
         decode, ode = self.view.whole()
-        return decode(t0, self.path.evaluate(t0, left=left), ode)
+        return decode.between(self.path, t0, left, ode)
 
 
 class DAESolution(eqx.Module):
@@ -225,7 +225,10 @@ class DAESolution(eqx.Module):
         return jax.tree.map(_last, self.ts, self.ys)
 
     def evaluate(self, t0: Time, t1: Time | None = None, left: bool = True) -> Any:
-        """The state at any time, where `SaveAt(dense=True)` was asked for."""
+        """The state at any time, where `SaveAt(dense=True)` was asked for. Its derivative by the time is ẏ there, by the equations; by
+        `RadauIIA5`, `BDF` and other solvers of residuals the slope of what is between steps, of a lower order than the state (of
+        tolerance 1e-8 about 1e-5 off), as are those by times of `SaveAt(ts=...)` and of events.
+        """
         if self.interpolation is None:
             raise ValueError("The solution has no dense output; pass `saveat=diffrax.SaveAt(dense=True)`.")
         return self.interpolation.evaluate(t0, t1, left)

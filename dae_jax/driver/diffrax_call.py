@@ -14,7 +14,7 @@ from jax import lax
 
 from .._compat import use_stepsize_tol
 from ..equations.manifold_ode import Equations, ManifoldODE
-from ..formulations import AbstractFormulation
+from ..formulations import AbstractFieldFormulation, AbstractFormulation
 from ..linalg import error_norm
 from ..solution import RESULTS, Interpolation, Split
 from ..solvers import (
@@ -26,6 +26,7 @@ from ..solvers import (
     takes_residuals,
 )
 from ..types import BoolScalar, Time, Y
+from .between_steps import along_flow
 from .bracket import bracketing
 from .crossings import OneCrossing, OnStates
 from .event_functions import known_to_conditions
@@ -53,9 +54,21 @@ class Decode(eqx.Module):
     solver: diffrax.AbstractSolver
 
     def __call__(self, t: Time, y: Y, ode: Equations) -> Any:
-        if isinstance(self.solver, AbstractManifoldSolver):
-            y = self.solver.retract(t, y, cast(ManifoldODE, ode))
-        return self.formulation.decode(t, y, ode)
+        return self.formulation.decode(t, self._retracted(t, y, ode), ode)
+
+    def between(self, path: diffrax.DenseInterpolation, t: Time, left: bool, ode: Equations) -> Any:
+        """The state at any time, whose derivative by it is ẏ where the method has a field."""
+        if not isinstance(self.formulation, AbstractFieldFormulation):
+            return self(t, path.evaluate(t, left=left), ode)
+        t = jnp.asarray(t, path.ts.dtype)
+        still = lax.stop_gradient(t)
+        y = self._retracted(still, path.evaluate(still, left=left), ode)
+        return self.formulation.decode(t, along_flow(y, t, self.formulation, ode), ode)
+
+    def _retracted(self, t: Time, y: Y, ode: Equations) -> Any:
+        return (
+            self.solver.retract(t, y, cast(ManifoldODE, ode)) if isinstance(self.solver, AbstractManifoldSolver) else y
+        )
 
 
 class View(eqx.Module):
