@@ -12,6 +12,7 @@ from ..linalg import take
 from ..structure import dependence
 from ..types import DType, Time
 from .manifold_ode import at_one_instant
+from .state_selection import selection
 from .structural_ode import StructuralODE
 
 
@@ -68,7 +69,7 @@ class Index1Form(eqx.Module):
         a part of the tolerance. Dummy derivatives move, as a nearest point depends on the unit of time.
         """
         form, y = self.ode.form, z[: self.ode.orders.size]
-        on, found = self.ode.retract_along(t, y, self.ode.selection(self.ode.leading(t, y))[0])
+        on, found = self.ode.retract_along(t, y, selection(self.ode.orders, self.ode.leading(t, y))[0])
         settled = jnp.concatenate([jnp.where(found, on, y), z[y.size :]])
         return form.decode(t, take(settled, self.ode.orders.places[0][: form.layout.size]))
 

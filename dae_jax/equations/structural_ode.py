@@ -1,7 +1,6 @@
 """The underlying ODE of any system 0 = F(t, y, ẏ), from the offsets of its structural analysis."""
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -10,12 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from ..linalg import (
     Tearing,
     amplified_roundoff,
-    determinant_sign,
     fixed_point,
     implicit_root,
     relative_change,
@@ -28,7 +26,7 @@ from ..linalg import (
 )
 from ..structure import Block, block_triangular, interpreted
 from ..systems import System, is_mechanism
-from ..types import Args, DType, Flat, IntScalar, Scalar, State, Time
+from ..types import Args, DType, Flat, State, Time
 from .constraint_jacobian import Rank
 from .derivative_orders import Combination, derivative_of, find_offsets
 from .initial_rates import is_nonlinear, rates_of
@@ -36,80 +34,22 @@ from .manifold_ode import Feedback, ManifoldODE, at_one_instant, constant
 from .mechanical import MechanicalODE
 from .nearest_point import nearest_point
 from .nearest_step import step_to
+from .orders import Orders
 from .probe import Probe
 from .residual_form import LARGE, ResidualForm
 from .sparse_invariants import FREE, SparseInvariants
+from .state_selection import lasting
 from .taylor import total_derivatives
 
 
 # Gauss–Newton's method for what is left of H at the initial state.
 STARTING = 100
-# A selection of states is kept until its smallest pivot is less than this part of the best one's.
-HYSTERESIS = 0.3
-# A selection is to be good for so many steps of the present size; a chart is as it is while less than this part of a normal turns in one.
-STEPS, TURNS = 100, 0.05
+# The normals are a chart's directions while less than this part of one turns in a step.
+TURNS = 0.05
 # With more equations, or constraints, a determinant takes longer than a step.
 ORIENTED = 32
 # What of H may be round-off, in parts of its terms and of the resolution of numbers.
 OFF = 1000
-
-
-@dataclasses.dataclass(frozen=True)
-class Orders:
-    """How often each equation is differentiated, C, and each variable, D. Compared by value.
-
-    The state of the underlying ODE holds, of each variable j, the derivatives of orders 0 to Dⱼ − 1.
-    """
-
-    equations: tuple[int, ...]
-    variables: tuple[int, ...]
-
-    @functools.cached_property
-    def places(self) -> list[Int[np.ndarray, " n"]]:
-        """For each order k, where y^(k) of each variable is in (Y, X), X the derivatives of order Dⱼ; −1 beyond."""
-        d = np.array(self.variables)
-        found, start = [], 0
-        for k in range(d.max() + 1):
-            inside = d > k
-            found.append(
-                np.where(inside, start + np.cumsum(inside) - 1, np.where(d == k, self.size + np.arange(len(d)), -1))
-            )
-            start += int(inside.sum())
-        return found
-
-    @functools.cached_property
-    def derivatives(self) -> Int[np.ndarray, " N"]:
-        """Where in (Y, X) the derivative of each entry of Y is."""
-        d = np.array(self.variables)
-        return np.concatenate([self.places[k + 1][d > k] for k in range(d.max())])
-
-    @functools.cached_property
-    def values(self) -> Int[np.ndarray, " N"]:
-        """Which variable each entry of Y is the value of, −1 for derivatives."""
-        first = np.flatnonzero(np.array(self.variables) > 0)
-        return np.concatenate([first, np.full(self.size - len(first), -1)])
-
-    @property
-    def first_derivatives(self) -> Int[np.ndarray, " N"]:
-        """Which variable each entry of Y is the first derivative of, −1 for others."""
-        found = np.full(self.size, -1)
-        for j, d in enumerate(self.variables):
-            if d > 1:
-                found[self.places[1][j]] = j
-        return found
-
-    @property
-    def size(self) -> int:
-        """The number of entries of Y."""
-        return sum(self.variables)
-
-    def rows(self, level: int) -> Int[np.ndarray, " rows"]:
-        """The equations whose derivative of order `level` is an invariant."""
-        return np.flatnonzero(np.array(self.equations) > level)
-
-    def dummies(self, k: int) -> Int[np.ndarray, " n"]:
-        """Where in Y the derivative of order Dⱼ − k of each variable is, a dummy derivative at level k; −1: nowhere."""
-        return np.array([self.places[d - k][j] if d >= k else -1 for j, d in enumerate(self.variables)])
 
 
 class StructuralODE(ManifoldODE):
@@ -279,7 +219,7 @@ class StructuralODE(ManifoldODE):
             return here
         there = lax.stop_gradient(self.normals(t1, ahead))
         along = jnp.abs(jnp.sum((there - here) * here, 1)) / jnp.sum(here * here, 1)
-        return jnp.where(jnp.any(along > TURNS), _lasting(here, there), here)
+        return jnp.where(jnp.any(along > TURNS), lasting(here, there), here)
 
     def sizes(self, t: Time, y: Float[Array, " N"], of: tuple[Float[Array, " N"], ...]) -> list[Float[Array, " m"]]:
         """Σ |∂H/∂Y| s of each invariant, for each s in `of`."""
@@ -334,57 +274,6 @@ class StructuralODE(ManifoldODE):
         residual = lambda mu, params: params[0].violations(params[1], params[0].displace(params[2], params[3], mu))
         mu, found = implicit_root(residual, iterate, (self, t, y, normals))
         return self.displace(y, normals, mu), found
-
-    def selection(
-        self,
-        leading: Float[Array, "n n"],
-        chosen: Float[Array, "m N"] | None = None,
-        ahead: Float[Array, "n n"] | None = None,
-    ) -> tuple[Float[Array, "m N"], Bool[Array, ""]]:
-        """Unit directions of the dummy derivatives, entries of Y that H = 0 determines given the others, and whether they
-        are not `chosen`.
-
-        Level by level, from the highest: the equations with Cᵢ ≥ k determine the derivatives of order Dⱼ − k of as many
-        variables, taken by complete pivoting on the `leading` matrix from those that the level before has taken; on entries
-        first that are about the same in that `ahead`, a step later.
-        """
-        d = np.array(self.orders.variables)
-        largest = jnp.max(jnp.abs(leading), 1, keepdims=True)
-        matrix = leading if ahead is None else _lasting(leading, ahead)
-        matrix = matrix / jnp.where(largest > 0, largest, 1)
-        infinite = jnp.asarray(jnp.inf, matrix.dtype)
-        available, quality, present, first, directions = jnp.ones(len(d), matrix.dtype), infinite, infinite, 0, []
-        for k in range(1, max(self.orders.equations) + 1):
-            rows = self.orders.rows(k - 1)
-            place = self.orders.dummies(k)
-            level = jnp.stack([matrix[i] for i in rows]) * (d >= k)
-            taken, smallest = _pivots(level * available)
-            quality, available = jnp.minimum(quality, smallest), jnp.sum(taken, 0)
-            embedding = np.zeros((len(d), self.orders.size))
-            embedding[place >= 0, place[place >= 0]] = 1
-            directions.append(jnp.sum(taken[:, :, None] * jnp.asarray(embedding, taken.dtype), 1))
-            if chosen is not None:
-                _, smallest = _pivots(level * take(jnp.sum(chosen[first : first + len(rows)], 0), place))
-                present = jnp.minimum(present, smallest)
-            first += len(rows)
-        best = jnp.concatenate(directions) if directions else jnp.zeros((0, self.orders.size), matrix.dtype)
-        if chosen is None or not directions:
-            return best, jnp.asarray(False)
-        keep = present >= HYSTERESIS * quality
-        return jnp.where(keep, chosen, best), ~keep
-
-    def orientation(self, leading: Float[Array, "n n"], chosen: Float[Array, "m N"]) -> Float[Array, " levels"]:
-        """The sign, level by level, of the determinant with which H = 0 determines the `chosen` dummy derivatives: it changes
-        only where these become undetermined.
-        """
-        first, signs = 0, []
-        for k in range(1, max(self.orders.equations) + 1):
-            rows, place = self.orders.rows(k - 1), self.orders.dummies(k)
-            directions = chosen[first : first + len(rows)]
-            columns = jnp.where(jnp.asarray(place >= 0), directions[:, np.maximum(place, 0)], 0)
-            signs.append(determinant_sign(row_products(leading[rows], columns)))
-            first += len(rows)
-        return jnp.stack(signs)
 
     # The user's state
 
@@ -473,36 +362,6 @@ def _nearest(
 
 def _by_y(*_: object) -> Any:
     raise NotImplementedError(f"The derivative of a consistent state is for up to {LARGE} unknowns.")
-
-
-def _lasting(start: Float[Array, "n n"], end: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """The entries of a matrix at a step's start, those less that change within some such steps: of an unknown in a large unit an entry
-    is large beside others until just before it is 0. Entries that are not known at the predicted end stay.
-    """
-    size, change = jnp.abs(start), STEPS * jnp.abs(end - start)
-    part = size / jnp.where(size > 0, size + change, 1)
-    return start * jnp.where(jnp.isnan(part), 1, part) ** 4
-
-
-def _pivots(a: Float[Array, "m N"]) -> tuple[Float[Array, "m N"], Float[Array, ""]]:
-    """The columns that elimination with complete pivoting takes, as unit rows, and the smallest pivot."""
-    m, n = a.shape
-
-    def eliminate(k: IntScalar, carry: tuple[Float[Array, "m N"], Float[Array, "m N"], Scalar]) -> Any:
-        a, taken, smallest = carry
-        place = jnp.argmax(jnp.abs(a).reshape(-1))
-        at_row, at_column = (jnp.arange(m) == place // n)[:, None], jnp.arange(n) == place % n
-        row = jnp.sum(jnp.where(at_row, a, 0), 0)
-        column = jnp.sum(jnp.where(at_column, a, 0), 1, keepdims=True)
-        pivot = jnp.sum(jnp.where(at_column, row, 0))
-        reduced = a - column * (row / jnp.where(pivot == 0, 1, pivot))
-        a = jnp.where(at_row | at_column, 0, reduced)
-        taken = jnp.where((jnp.arange(m) == k)[:, None], jnp.where(at_column, 1, 0).astype(a.dtype), taken)
-        return a, taken, jnp.minimum(smallest, jnp.abs(pivot))
-
-    infinite = jnp.asarray(jnp.inf, a.dtype)
-    _, taken, smallest = lax.fori_loop(0, m, eliminate, (a, jnp.zeros_like(a), infinite))
-    return taken, smallest
 
 
 def underlying_ode(

@@ -11,6 +11,7 @@ from ..equations.independent import independent
 from ..equations.index1_form import Index1Form
 from ..equations.linearised import LinearisedResidual
 from ..equations.residual_form import ResidualForm
+from ..equations.state_selection import selection
 from ..equations.structural_ode import StructuralODE
 from ..systems import System
 from ..types import Args, State, Time, Y
@@ -72,7 +73,7 @@ class ReducedResidual(AbstractResidualFormulation):
         self, system: System, t: Time, state: State, args: Args = None, rank: int | Rank | None = None
     ) -> tuple[Any, LinearisedResidual]:
         y, ode = DummyDerivatives().encode(system, t, state, args, rank)
-        form = Index1Form(ode, ode.selection(ode.leading(t, y))[0])
+        form = Index1Form(ode, selection(ode.orders, ode.leading(t, y))[0])
         z = form.encode(t, y)
         # The selection changes: the structure is that of all of them.
         linearised = LinearisedResidual.of(form.with_all_candidates(y.dtype), z)

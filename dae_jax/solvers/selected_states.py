@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from ..equations.manifold_ode import constant
+from ..equations.state_selection import orientation, selection
 from ..equations.structural_ode import OFF, StructuralODE
 from ..linalg import row_products, solve
 from ..types import BoolLike, Time, Y
@@ -42,12 +43,12 @@ def _selected(
     sign = time_sign(terms, t0, t1)
     start = ode.leading(sign * t0, y0)
     ahead = ode.leading(sign * t1, y0 + terms.contr(t0, t1) * rates) if ode.varying else start
-    return *ode.selection(start, chosen, ahead), start
+    return *selection(ode.orders, start, chosen, ahead), start
 
 
 def _stays(ode: StructuralODE, directions: Any, start: Any, end: Any) -> Any:
     """Whether the others determine the dummy derivatives all the way between these leading matrices."""
-    return jnp.all(ode.orientation(start, directions) * ode.orientation(end, directions) > 0)
+    return jnp.all(orientation(ode.orders, start, directions) * orientation(ode.orders, end, directions) > 0)
 
 
 class SelectedStates(Replayable, AbstractChartSolver):
@@ -65,7 +66,7 @@ class SelectedStates(Replayable, AbstractChartSolver):
     counts: ClassVar[tuple[str, ...]] = ("switches",)
 
     def init(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any) -> Selection:
-        directions, _ = args.selection(args.leading(time_sign(terms, t0, t1) * t0, y0))
+        directions, _ = selection(args.orders, args.leading(time_sign(terms, t0, t1) * t0, y0))
         return Selection(terms.vf(t0, y0, args), directions, jnp.asarray(0))
 
     def step(

@@ -167,19 +167,19 @@ def off_of_a_pendulum_on_a_moving_support(solver, formulation, tolerance):
 
 
 @pytest.mark.parametrize(
-    ("solver", "formulation"),
+    ("solver", "formulation", "tolerance"),
     [
-        (dae_jax.BDF(), dae_jax.DummyDerivatives()),
-        (dae_jax.RadauIIA5(), dae_jax.DummyDerivatives()),
-        (dae_jax.DOP853(), dae_jax.DummyDerivatives()),
-        (dae_jax.TangentSpace(dae_jax.DOP853()), None),
+        (dae_jax.BDF(), dae_jax.DummyDerivatives(), 1e-7),
+        (dae_jax.RadauIIA5(), dae_jax.DummyDerivatives(), 1e-7),
+        (dae_jax.DOP853(), dae_jax.DummyDerivatives(), 1e-7),
+        (dae_jax.TangentSpace(dae_jax.DOP853()), None, 1e-5),
     ],
     ids=["bdf", "radau", "explicit", "tangent"],
 )
-def test_states_and_charts_are_chosen_in_any_unit(solver, formulation):
+def test_states_and_charts_are_chosen_in_any_unit(solver, formulation, tolerance):
     """Near y = 0, which is small in km, x has to follow from y, though its entry in the constraint is small in mm. (`BDF` was off by up to
     86,000 tolerances, `TangentSpace` by 1,000 to 200,000; the others stood still there.)
     """
-    off, reached = off_of_a_pendulum_on_a_moving_support(solver, formulation, 1e-7)
+    off, reached = off_of_a_pendulum_on_a_moving_support(solver, formulation, tolerance)
     assert reached
-    assert off < 1000e-7
+    assert off < 1000 * tolerance

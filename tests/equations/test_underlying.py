@@ -9,9 +9,10 @@ from scipy.sparse import csr_array
 
 import dae_jax
 from dae_jax.equations.derivative_orders import Combination, find_offsets
+from dae_jax.equations.orders import Orders
 from dae_jax.equations.residual_form import ResidualForm
 from dae_jax.equations.sparse_invariants import SparseInvariants
-from dae_jax.equations.structural_ode import Orders, StructuralODE
+from dae_jax.equations.structural_ode import StructuralODE
 from dae_jax.linalg import Tearing
 from dae_jax.scenes import SCENES, pendulum
 
