@@ -177,8 +177,8 @@ def off_of_a_pendulum_on_a_moving_support(solver, formulation, tolerance):
     ids=["bdf", "radau", "explicit", "tangent"],
 )
 def test_states_and_charts_are_chosen_in_any_unit(solver, formulation, tolerance):
-    """Near y = 0, which is small in km, x has to follow from y, though its entry in the constraint is small in mm. (`BDF` was off by up to
-    86,000 tolerances, `TangentSpace` by 1,000 to 200,000; the others stood still there.)
+    """Near y = 0, which is small in km, x has to follow from y, though its entry in the constraint is small in mm. (In 5 s `BDF`
+    was off by 86,000 tolerances, `TangentSpace` in 2 s by 1,000 to 200,000; the others stood still there.)
     """
     off, reached = off_of_a_pendulum_on_a_moving_support(solver, formulation, tolerance)
     assert reached
