@@ -22,7 +22,11 @@ def interruptible() -> Iterator[None]:
             main = threading.main_thread().ident
             again = threading.Timer(0.01, signal.pthread_kill, (main, signal.SIGINT))
             again.daemon = True
-            again.start()
+            try:
+                again.start()
+            except KeyboardInterrupt:
+                # On a busy machine a moment may pass before it is known to have started; from here it would be lost.
+                hook(unraisable)
         else:
             before(unraisable)
 

@@ -9,6 +9,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 import weakref
 from pathlib import Path
@@ -358,6 +359,25 @@ def test_an_interruption_where_python_ignores_exceptions_is_not_lost(where):
             RaisedWhenDeleted()
         time.sleep(20)
 
+    with pytest.raises(KeyboardInterrupt), interruptible():
+        ignored()
+
+
+def test_an_interruption_while_another_is_sent_again_is_not_lost(monkeypatch):
+    """As on a busy machine, where the moment is over before `start` comes back."""
+    start, late = threading.Timer.start, []
+
+    def slow(self):
+        start(self)
+        if not late:
+            late.append(True)
+            time.sleep(1)
+
+    def ignored():
+        RaisedWhenDeleted()
+        time.sleep(20)
+
+    monkeypatch.setattr(threading.Timer, "start", slow)
     with pytest.raises(KeyboardInterrupt), interruptible():
         ignored()
 
