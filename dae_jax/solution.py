@@ -282,8 +282,11 @@ def precision_of(dtype: DType, controller: diffrax.AbstractStepSizeController) -
     if not isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
         return f"{np.dtype(dtype)}, fixed steps"
     given = {name: getattr(controller, name, None) for name in ("rtol", "atol")}
-    said = [f"{name} {value:g}" for name, value in given.items() if isinstance(value, float | int)]
-    return ", ".join([str(np.dtype(dtype)), *said])
+    numbers = [f"{name} {value:g}" for name, value in given.items() if isinstance(value, float | int)]
+    each = [
+        f"{name} for each unknown" for name, value in given.items() if jax.tree.leaves(jax.tree.map(jnp.shape, value))
+    ]
+    return ", ".join([str(np.dtype(dtype)), *numbers, *each])
 
 
 @jax.jit

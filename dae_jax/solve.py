@@ -22,6 +22,7 @@ from .driver.problem import Problem, Program, split
 from .driver.program import KEPT, Solve, run, traces
 from .driver.resets import Reset
 from .driver.start import as_array, checked, refuse_bad_start, refuse_bad_times
+from .driver.tolerances import with_tolerances
 from .equations.independent import is_crowded, rows_of
 from .equations.residual_form import LARGE, Form
 from .formulations import (
@@ -87,7 +88,9 @@ def daesolve(
       0 = F(t, y, ẏ) such as `RadauIIA5`, `Residual()`, or `DummyDerivatives()` where these need not converge for the
       equations as they are written (an index that is too high, or a null space of ∂F/∂ẏ that changes).
     - `stepsize_controller`: by default fixed steps if `dt0` is given, else `PIDController(rtol=1e-8, atol=1e-8)` (1e-5 in
-      float32).
+      float32). Where unknowns have units of their own, `rtol` and `atol` may be in the structure of `y0`, with numbers or arrays in
+      place of its arrays, such as `atol=(1e-9, 1e-6)` for (q, v). A derivative ẏ, ÿ, … that is integrated has the tolerance of y, a
+      multiplier that of the velocities along its constraint.
     - `saveat`, `adjoint`, `event`, `max_steps`, `throw`, `progress_meter`: as in diffrax. Functions in `saveat` and
       `event` get the state in the structure of `y0`, and the user's `args`. With a `Reset` as `event` the solve goes on
       after it. Derivatives are those of the numerical solution: where steps leap over a kink of a function (`abs`, `where`, `sort`)
@@ -171,7 +174,7 @@ def prepared(
     elif formulation.selects_states:
         solver = SelectedStates(solver)
     dtype = jnp.result_type(*jax.tree.leaves(y0))
-    controller: Any = stepsize_controller or _default_controller(dt0, dtype)
+    controller: Any = with_tolerances(stepsize_controller or _default_controller(dt0, dtype), y0)
     controller = jax.tree.map(lambda x: as_array(x, dtype) if _is_real(x) else x, controller)
     start, end, step = as_array(t0, dtype), as_array(t1, dtype), None if dt0 is None else as_array(dt0, dtype)
     saveat = jax.tree.map(lambda x: as_array(x, dtype) if isinstance(x, np.ndarray | jax.Array) else x, saveat)

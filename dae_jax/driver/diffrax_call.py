@@ -39,6 +39,7 @@ from .problem import Problem
 from .start import is_saved_part
 from .summed_errors import SummedErrors
 from .switches import stepped_over
+from .tolerances import in_integrated, in_one_vector
 from .traced_once import TracedOnce
 from .trajectory_adjoint import as_it_is, can_be_taped
 
@@ -89,8 +90,8 @@ def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[
     t0, t1, dt0, args = problem.t0, problem.t1, problem.dt0, problem.args
     y, ode = solve.encoded(problem)
     decode = Decode(solve.formulation, solve.solver)
-    solver, controller = economical(solve.solver, solve.between()), _fitted(solve.controller)
-    _refuse_other_tolerances(controller, y)
+    solver = economical(solve.solver, solve.between())
+    controller = in_integrated(_fitted(solve.controller), t0, y, ode, solve.formulation)
     felt = SMALL * jax.lax.stop_gradient(jnp.abs(t1 - t0)) if isinstance(solve.adjoint, OneDirection) else None
     if takes_residuals(solver):
         solver = _with_tolerances_of(controller, solver)
@@ -100,7 +101,8 @@ def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[
         chosen = dt0 is None and not isinstance(controller, diffrax.StepTo)
         dt0 = first_step(ode.start, solver, t0, t1, y) if chosen else dt0
     else:
-        solver, controller = _with_tolerances_within(solver, controller), _with_smallest_step(controller, t0, t1)
+        controller = in_one_vector(_with_smallest_step(controller, t0, t1), y)
+        solver = _with_tolerances_within(solver, controller)
 
     def saved(part: diffrax.SubSaveAt) -> Any:
         return part if part.fn is as_it_is else eqx.tree_at(lambda s: s.fn, part, View(part.fn, decode, args))
@@ -232,20 +234,6 @@ def _may_ignore_errors(controller: Any) -> bool:
     return (
         isinstance(controller, diffrax.ConstantStepSize) or forced or (inner is not None and _may_ignore_errors(inner))
     )
-
-
-def _refuse_other_tolerances(controller: diffrax.AbstractStepSizeController, y: Y) -> None:
-    """Refuses a tolerance for each number of the state where what is integrated is another."""
-    for name in ("rtol", "atol"):
-        tolerance = getattr(controller, name, None)
-        if not isinstance(tolerance, jax.Array) or tolerance.ndim == 0:
-            continue
-        sizes = {leaf.shape for leaf in jax.tree.leaves(y)}
-        if any(tolerance.shape not in (shape, (1,)) for shape in sizes):
-            raise ValueError(
-                f"`{name}` of the step-size control has the shape {tolerance.shape}, but what this method integrates has "
-                f"{' and '.join(map(str, sorted(sizes)))}: give a number."
-            )
 
 
 def _with_tolerances_within(solver: Any, controller: diffrax.AbstractStepSizeController) -> Any:

@@ -11,7 +11,7 @@ from ..consistent import Violation, unsolved, violation
 from ..equations.constraint_jacobian import Rank
 from ..equations.independent import Rows, independent
 from ..equations.mechanical import MechanicalODE
-from ..equations.regularity import LARGE, bearable_drift, has_rank, is_near_constraints, mass_is_regular, weakest
+from ..equations.regularity import LARGE, Span, bearable_drift, has_rank, is_near_constraints, mass_is_regular, weakest
 from ..systems import System, is_mechanism
 from ..types import Args, Scalar, State, Time
 
@@ -57,7 +57,7 @@ def look(
     invertible: bool,
     end: tuple[Scalar, State],
     keeps: tuple[bool, bool],
-    tolerances: tuple[Time, Time],
+    tolerances: tuple[Span, Span],
     residual: bool,
 ) -> tuple[Start, End]:
     """The start and the `end` (t, y) of a solve. `rows`: the constraints that the method gets where not all; `invertible`: whether M
@@ -88,7 +88,7 @@ def look(
 
 
 def _look_at_equations(
-    system: System, t0: Time, start: State, args: Args, end: tuple[Scalar, State], tolerances: tuple[Time, Time]
+    system: System, t0: Time, start: State, args: Args, end: tuple[Scalar, State], tolerances: tuple[Span, Span]
 ) -> tuple[Start, End]:
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(end)]))
     both = jax.tree.map(lambda a, b: jnp.stack([a, jnp.where(finite, b, a)]), (jnp.asarray(t0), start), end)
@@ -98,7 +98,7 @@ def _look_at_equations(
     at_start, at_end = (jax.tree.map(operator.itemgetter(k), left) for k in (0, 1))
     consistent, off = at_start.consistent(), at_end.as_part()
     wrong = jnp.where(consistent, jnp.where(at_start.several, 4, 0), 1)
-    rtol, atol = tolerances
+    rtol, atol = (least for least, _ in tolerances)
     drifted = (off > bearable_drift(rtol + atol, 1)) & (rtol + atol > 0)
     no = jnp.asarray(False)
     return Start(wrong, wrong == 0), End(~(off > LARGE), no, ~no, ~no, drifted)

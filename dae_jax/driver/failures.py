@@ -30,6 +30,7 @@ from ..validate.user_functions import not_finite
 from .followed_steps import Steps, of_bits, reach
 from .problem import Problem, Program, split
 from .start import ADVICE
+from .tolerances import NAMES, of_state
 
 
 OKAY = tuple(int(code._value) for code in (RESULTS.successful, RESULTS.event_occurred))
@@ -110,18 +111,23 @@ def not_finite_beyond(sol: DAESolution, problem: Problem) -> str:
 
 def below_roundoff(sol: DAESolution, controller: diffrax.AbstractStepSizeController) -> str:
     """That no step can meet the tolerances, where that is so at the end of a solve that found none; else empty."""
-    tolerances = [jax.tree.leaves(lax.stop_gradient(getattr(controller, name, None))) for name in ("rtol", "atol")]
-    state = jax.tree.leaves(lax.stop_gradient(sol.end[1]))
-    known = all(tolerances) and not any(isinstance(x, Tracer) for x in jax.tree.leaves((tolerances, state)))
+    state = lax.stop_gradient(sol.end[1])
+    tolerances = [lax.stop_gradient(of_state(controller, name, state)) for name in NAMES]
+    adapts = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
+    known = adapts and not any(isinstance(x, Tracer) for x in jax.tree.leaves((tolerances, state)))
     if int(sol.result._value) not in _OF_A_STEP or not known:
         return ""
-    rtol, atol = (min(float(np.min(x)) for x in of) for of in tolerances)
-    size, eps = max(float(np.max(np.abs(x), initial=0)) for x in state), float(np.finfo(state[0].dtype).eps)
-    if not rtol * size + atol < eps * size:
+    each = zip(*map(jax.tree.leaves, (state, *tolerances)), strict=True)
+    whole = [np.stack(np.broadcast_arrays(np.abs(x), *of)).reshape(3, -1) for x, *of in each]
+    size, rtol, atol = np.concatenate(whole, 1)
+    eps = float(np.finfo(size.dtype).eps)
+    below = rtol * size + atol < eps * size
+    if not np.any(below):
         return ""
+    worst = np.argmax(size * below)
     return (
-        f"The tolerances, rtol = {rtol:.3g} and atol = {atol:.3g}, are below round-off, which is {eps:.2g} of a number: no step meets "
-        "them."
+        f"The tolerances, rtol = {rtol[worst]:.3g} and atol = {atol[worst]:.3g}, are below round-off, which is {eps:.2g} of a number: "
+        "no step meets them."
     )
 
 

@@ -4,16 +4,13 @@ import functools
 import typing
 
 import diffrax
-import jax
-import numpy as np
 import optimistix
-from jax.core import Tracer
 
 from .._compat import use_stepsize_tol
 from ..formulations import AbstractFormulation, AbstractResidualFormulation
 from ..solvers import AbstractManifoldSolver, is_explicit, takes_residuals
 from ..types import Time
-from ..validate.states import NUMBERS, brief
+from ..validate.states import brief
 from .resets import Reset
 
 
@@ -57,7 +54,6 @@ def refuse_wrong_options(
             "`root_finder` of diffrax.Event must be a root finder such as optimistix.Newton(1e-8, 1e-8), but is "
             f"{brief(event.root_finder)}."
         )
-    _refuse_bad_tolerances(controller)
 
 
 _right_types: set[tuple[type, ...]] = set()
@@ -71,20 +67,6 @@ def _refuse_wrong_types(types: tuple[type, ...], given: tuple[object, ...]) -> N
         if not isinstance(value, kind):
             raise TypeError(f"`{name}` must be {what}, but is {brief(value)}.")
     _right_types.add(types)
-
-
-def _refuse_bad_tolerances(controller: object) -> None:
-    if type(controller) is not diffrax.PIDController:
-        return
-    given = [controller.rtol, controller.atol]
-    if all(type(x) is float and x > 0 for x in given) or any(isinstance(x, Tracer) for x in jax.tree.leaves(given)):
-        return
-    fine = all(isinstance(x, NUMBERS) and np.all(np.asarray(x) >= 0) for x in given)
-    if not fine or not any(np.any(np.asarray(x)) for x in given):
-        raise ValueError(
-            "`stepsize_controller` must have positive tolerances, numbers or arrays, but has "
-            f"rtol = {brief(given[0])} and atol = {brief(given[1])}: write PIDController(rtol=1e-6, atol=1e-6)."
-        )
 
 
 def refuse_misfits(formulation: AbstractFormulation, solver: diffrax.AbstractSolver) -> None:

@@ -36,6 +36,7 @@ from .outcome import judged
 from .problem import Problem, Program, split
 from .resets import Reset, solve_with_resets
 from .start import saved_parts
+from .tolerances import span_of
 from .trajectory_adjoint import Taped, as_it_is, can_be_taped, cotangents, recorded, saved_times
 
 
@@ -176,9 +177,9 @@ class Solve:
         # Points between the steps of a solver of residuals are off by what its dense output is.
         keeps = (False, False) if residual and self.event is not None else self.keeps()
         if isinstance(self.controller, diffrax.AbstractAdaptiveStepSizeController):
-            tolerances = tuple(jnp.max(jnp.asarray(getattr(self.controller, name))) for name in ("rtol", "atol"))
+            tolerances = tuple(span_of(getattr(self.controller, name)) for name in ("rtol", "atol"))
         else:
-            tolerances = (0.0, 0.0) if residual else (COARSE, COARSE)
+            tolerances = ((0.0, 0.0),) * 2 if residual else ((COARSE, COARSE),) * 2
         known = {} if self.event is None else known_to_conditions(self, problem)
         program, arrays = split((*problem.start, end, tolerances, self.event, known))
         invertible, rank, rows = self.formulation.inverts_mass, problem.rank, problem.rows

@@ -50,8 +50,8 @@ def level_at_start(
     together: Scalar,
     found: Scalar,
     moved: Scalar,
-    rtol: Scalar,
-    atol: Scalar,
+    rtol: State,
+    atol: State,
 ) -> Any:
     """The condition at the start of a part; where this is zero, the sign with which it leaves zero, forwards or, with `sign` −1,
     backwards, or 0 where it is not seen to leave. And what it is off by, and for how long it may not have left zero by as much.
@@ -89,8 +89,9 @@ def level_at_start(
     return lax.stop_gradient((level, off, near))
 
 
-def error_of(condition: Callable[..., Time], t: Scalar, y: State, args: Args, rtol: Scalar, atol: Scalar) -> Scalar:
-    """By how much the condition may be off where the state is so by its tolerances."""
+def error_of(condition: Callable[..., Time], t: Scalar, y: State, args: Args, rtol: State, atol: State) -> Scalar:
+    """By how much the condition may be off where the state is so by its tolerances, in the structure of the state."""
     slopes = jax.grad(lambda y: jnp.asarray(condition(t, y, args), t.dtype))(y)
-    errors = jax.tree.map(lambda slope, x: jnp.sum(jnp.abs(slope) * (rtol * jnp.abs(x) + atol)), slopes, y)
+    off = lambda slope, x, rtol, atol: jnp.sum(jnp.abs(slope) * (rtol * jnp.abs(x) + atol))
+    errors = jax.tree.map(off, slopes, y, rtol, atol)
     return sum(jax.tree.leaves(errors), jnp.zeros_like(t))

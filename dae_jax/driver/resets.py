@@ -25,6 +25,7 @@ from .ends import Start
 from .problem import Problem, count_of, split
 from .reset_levels import FromStart, error_of, level_at_start
 from .start import saved_parts
+from .tolerances import of_state
 
 
 if TYPE_CHECKING:
@@ -142,7 +143,7 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Start]
     numbers, others = eqx.partition(args, _is_number)
     # In which the order of resets is round-off.
     together = 16 * float(jnp.finfo(t0.dtype).eps) ** 0.75 * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
-    tolerances = [jnp.max(jnp.asarray(getattr(solve.controller, x, 0.0), t0.dtype)) for x in ("rtol", "atol")]
+    tolerances = [of_state(solve.controller, name, y0) for name in ("rtol", "atol")]
     unknown = jnp.zeros_like(t0)
     going = int(RESULTS.event_occurred._value)
 
@@ -228,7 +229,7 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Start]
     return sol, Start(jnp.where(fine, 0, 1), fine)
 
 
-def _differs(condition: Callable[..., Any], t: Time, y: State, args: Args, rtol: Scalar, atol: Scalar) -> BoolScalar:
+def _differs(condition: Callable[..., Any], t: Time, y: State, args: Args, rtol: State, atol: State) -> BoolScalar:
     """Whether the condition is not zero, by more than the state may be off."""
     t = jnp.asarray(t)
     return jnp.abs(condition(t, y, args)) > error_of(condition, t, y, args, rtol, atol)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..linalg import take
 from ..structure import dependence
-from ..types import DType, Time
+from ..types import DType, State, Time
 from .manifold_ode import at_one_instant
 from .state_selection import selection
 from .structural_ode import StructuralODE
@@ -72,6 +72,11 @@ class Index1Form(eqx.Module):
         on, found = self.ode.retract_along(t, y, selection(self.ode.orders, self.ode.leading(t, y))[0])
         settled = jnp.concatenate([jnp.where(found, on, y), z[y.size :]])
         return form.decode(t, take(settled, self.ode.orders.places[0][: form.layout.size]))
+
+    def tolerances(self, t: Time, state: State, each: State) -> Float[Array, " z"]:
+        """A tolerance for each unknown, of one for `each` number of the state."""
+        own = self.ode.form.tolerances(t, state, each)
+        return jnp.concatenate([take(own, self.ode.orders.owners), own])
 
     def known_rates(self, z: Float[Array, " z"]) -> Float[Array, " z"]:
         """What z itself says of ż: the rate of all of Y."""

@@ -23,7 +23,7 @@ from ..structure import (
     sigma_method,
     signature,
 )
-from ..types import BoolLike, Flat, Scalar, Time
+from ..types import BoolLike, Flat, Scalar, State, Time
 from .compression import Compression
 from .derivative_orders import Combination, Offsets, find_offsets
 from .index1_form import Index1Form
@@ -107,6 +107,10 @@ class LinearisedResidual(eqx.Module):
     def decode(self, t: Time, y: Float[Array, " n"]) -> Any:
         """The state in the user's structure."""
         return self.form.decode(t, y)
+
+    def tolerances(self, t: Time, y: Float[Array, " n"], each: State) -> Float[Array, " n"]:
+        """A tolerance for each unknown, of one for `each` number of the state."""
+        return self.form.tolerances(t, self.decode(t, y), each)
 
     def residual(self, t: Time, y: Float[Array, " n"], yd: Float[Array, " n"]) -> Float[Array, " n"]:
         """F(t, y, ẏ)."""

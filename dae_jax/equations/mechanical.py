@@ -87,6 +87,10 @@ class MechanicalODE(ManifoldODE):
         q, v = state
         return self.layout.flatten(q), self.layout.flatten(v)
 
+    def tolerances(self, t: Time, y: Phase, each: State) -> Any:
+        """A tolerance for each number of y, of one for `each` of the state."""
+        return self.encode(each)
+
     # The system's functions on flat vectors
 
     def force(self, t: Time, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -43,6 +43,12 @@ class Orders:
         return np.concatenate([first, np.full(self.size - len(first), -1)])
 
     @property
+    def owners(self) -> Int[np.ndarray, " N"]:
+        """Which variable each entry of Y is the value or a derivative of."""
+        d = np.array(self.variables)
+        return np.concatenate([np.flatnonzero(d > k) for k in range(d.max())])
+
+    @property
     def first_derivatives(self) -> Int[np.ndarray, " N"]:
         """Which variable each entry of Y is the first derivative of, −1 for others."""
         found = np.full(self.size, -1)

@@ -1,6 +1,6 @@
 """What must hold of a mechanism where a solve starts and where it ends: its masses, its constraints' rank, and no drift."""
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -254,6 +254,10 @@ def _is_turned(product: Float[Array, "m m"], scale: Float[Array, " m"], rank: in
     return minor_sign(jax.lax.stop_gradient(product * scale[:, None] * scale), rank) < 0
 
 
+# The smallest and the largest of the tolerances of all unknowns.
+Span: TypeAlias = tuple[Time, Time]
+
+
 def bearable_drift(tolerance: Float[ArrayLike, "..."], size: Num[ArrayLike, "..."]) -> Float[Array, "..."]:
     """How far a solution of that size may be off what its method lets drift, and still be trusted."""
     return jnp.minimum(DRIFTED * tolerance, FEW * tolerance + VISIBLE * size)
@@ -265,16 +269,16 @@ def is_near_constraints(
     start: Phase,
     end: Phase,
     keeps: tuple[bool, bool],
-    tolerances: tuple[Time, Time],
+    tolerances: tuple[Span, Span],
     residual: bool,
 ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
     """Whether a flat state at the end of a solve satisfies g and (ġ, h), and whether it has drifted by more than the tolerances.
 
     A level that the method `keeps` must hold to round-off, or to the tolerances (relative, absolute) where it solves for a
     `residual`. One that it lets drift may be off by a part of the solution's size; of constraints that depend on each
-    other, all as much as any.
+    other, all as much as any. Where each unknown has tolerances of its own, the largest ones are allowed, and the smallest were asked for.
     """
-    rtol, atol = tolerances
+    (rtol, largest_rtol), (atol, largest_atol) = tolerances
     root = jnp.finfo(end[0].dtype).eps ** 0.5
     size = lambda x: jnp.max(jnp.abs(x), initial=0)
     lengths = jnp.maximum(size(start[0]), size(end[0]))
@@ -288,7 +292,7 @@ def is_near_constraints(
     own = own[0], jnp.maximum(own[1], jnp.sqrt(field * own[0]))
     levels = ode.distances(t, end), keeps, (lengths, speeds), ode.sizes(t, end, own)
     for distance, kept, here, each in zip(*levels, strict=True):
-        by_tolerance = LEFT * (atol + rtol * here) if residual or not kept else 0
+        by_tolerance = LEFT * (largest_atol + largest_rtol * here) if residual or not kept else 0
         allowed = root * (1 + here) + by_tolerance + (0 if kept else LARGE * here)
         near = near & jnp.all(distance <= allowed)
         if not kept:

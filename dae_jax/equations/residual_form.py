@@ -136,6 +136,20 @@ class ResidualForm(eqx.Module):
         """The state in the user's structure."""
         return self.layout.unflatten(y[: self.layout.size])
 
+    def tolerances(self, t: Time, state: State, each: State) -> Float[Array, " n"]:
+        """A tolerance for each unknown, of one for `each` number of the state, τ: a multiplier has that of the velocities along its
+        constraint, (Σ aᵢ² τᵢ² / Σ aᵢ²)^½.
+        """
+        own = self.layout.flatten(each)
+        if not is_mechanism(self.system):
+            return own
+        ode = MechanicalODE.of(self.system, t, state, self.args)
+        squares = jax.lax.stop_gradient(ode.constraint_jacobian(t, *ode.encode(state))) ** 2
+        sums = jnp.sum(squares, 1)
+        weights = jnp.where(sums[:, None] > 0, squares / jnp.where(sums > 0, sums, 1)[:, None], 1 / squares.shape[1])
+        along = jnp.sqrt(jnp.sum(weights * ode.encode(each)[1] ** 2, 1))
+        return jnp.concatenate([own, along, along])[: self.size]
+
     @property
     def may_be_nonlinear(self) -> bool:
         """Whether ẏ may occur other than linearly."""

@@ -283,6 +283,10 @@ class StructuralODE(ManifoldODE):
         both = jnp.concatenate([y, self.highest(t, y)]) if algebraic else y
         return self.form.decode(t, take(both, self.orders.places[0][:count]))
 
+    def tolerances(self, t: Time, y: Float[Array, " N"], each: State) -> Float[Array, " N"]:
+        """A tolerance for each number of y, of one for `each` of the state; derivatives have that of their variable."""
+        return take(self.form.tolerances(t, self.decode(t, y), each), self.orders.owners)
+
     def encode(self, t: Time, state: State) -> Float[Array, " N"]:
         """Y of a state: the derivatives of order 1 and higher are those with which the equations hold, or nearly hold."""
         return self.start(t, self.form.encode(state), None)

@@ -1,7 +1,6 @@
 """What a solution does with hidden constraints, multipliers at a point, and how a failure gets out of a compiled program."""
 
 import dataclasses
-import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -282,18 +281,6 @@ class TestAdvice:
         system = dae_jax.SemiExplicitDAE(lambda t, x, z, args: -x + z, twice)
         with pytest.raises(RuntimeError, match="singular"):
             dae_jax.daesolve(system, dae_jax.BDF(), 0.0, 1.0, None, (np.ones(3), np.ones(3)))
-
-    def test_tolerances_for_each_number_of_another_state(self):
-        system = dae_jax.ImplicitDAE(lambda t, y, yd, args: jnp.stack([yd[0] - y[1], y[0] - jnp.sin(t)]))
-        each = diffrax.PIDController(rtol=1e-6, atol=jnp.array([1e-6, 1e-3]))
-        solve = functools.partial(
-            dae_jax.daesolve, system, dae_jax.BDF(), 0.0, 1.0, None, jnp.array([0.0, 1.0]), stepsize_controller=each
-        )
-        with pytest.raises(
-            ValueError, match=r"`atol` of the step-size control has the shape \(2,\), but .* \(3,\): give a number"
-        ):
-            solve(formulation=dae_jax.DummyDerivatives())
-        np.testing.assert_allclose(solve(formulation=dae_jax.Residual()).final, [np.sin(1), np.cos(1)], atol=1e-3)
 
 
 def test_multipliers_at_a_point_of_redundant_constraints_need_the_rank():

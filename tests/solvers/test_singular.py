@@ -104,7 +104,7 @@ class TestRedundantConstraints:
         system = pendulum(lambda t, q, args: jnp.stack([circle(q), circle(q) - t**3]))
         ode = MechanicalODE.of(system, 0.0, LEVEL, None, rank=1)
         near = lambda t, q: bool(
-            is_near_constraints(ode, t, LEVEL, (q, LEVEL[1]), (False, False), (1e-8, 1e-8), False)[0]
+            is_near_constraints(ode, t, LEVEL, (q, LEVEL[1]), (False, False), ((1e-8, 1e-8),) * 2, False)[0]
         )
         assert near(0.0, LEVEL[0])
         assert near(0.0, 1.001 * LEVEL[0])
