@@ -26,6 +26,11 @@ def lacks_reverse_derivatives(error: ValueError) -> bool:
     return str(error).startswith("Linearization failed")
 
 
+def is_a_loop_without_reverse(error: ValueError) -> bool:
+    """Whether a loop was differentiated in reverse whose number of turns is found on the way."""
+    return str(error).startswith("Reverse-mode differentiation does not work")
+
+
 def is_captured(error: TypeError) -> bool:
     """Whether a compiled function closes over a number that is being differentiated."""
     return str(error).startswith("No constant handler for type") and "Tracer" in str(error)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
+from .._compat import is_a_loop_without_reverse, lacks_reverse_derivatives
 from ..linalg import fixed_point, implicit_root, relative_change, solve
 from ..structure.layout import Layout
 from ..systems import ConstrainedSystem
@@ -151,6 +152,20 @@ class MechanicalODE(ManifoldODE):
         if self.nonholonomic:
             rows.append(jax.jacfwd(self._nonholonomic, 2)(t, q, v))
         return jnp.concatenate(rows) if len(rows) > 1 else rows[0]
+
+    def reaction(self, t: Time, q: Float[Array, " n"], v: Float[Array, " n"], multipliers: Flat) -> Float[Array, " n"]:
+        """Aᵀ(λ, μ), or Gᵀλ of so many: by reverse derivatives, which take no longer than the constraints, where there are such."""
+        of_positions, of_velocities = functools.partial(self.constraint, t), functools.partial(self._nonholonomic, t, q)
+        parts = [(of_positions, q, multipliers[: self.holonomic]), (of_velocities, v, multipliers[self.holonomic :])]
+        try:
+            forces = [jax.vjp(function, at)[1](along)[0] for function, at, along in parts if along.size]
+        except ValueError as error:
+            if not (lacks_reverse_derivatives(error) or is_a_loop_without_reverse(error)):
+                raise
+            forces = [
+                jnp.sum(along[:, None] * jax.jacfwd(function)(at), 0) for function, at, along in parts if along.size
+            ]
+        return sum(forces, jnp.zeros_like(q))
 
     def bias(self, t: Time, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " mp"]:
         """γ, the second derivative of g and the first of h where v̇ = 0."""

@@ -40,7 +40,7 @@ def selection(
     for k in range(1, max(orders.equations) + 1):
         rows = orders.rows(k - 1)
         place = orders.dummies(k)
-        level = jnp.stack([matrix[i] for i in rows]) * (d >= k)
+        level = matrix[rows] * (d >= k)
         taken, smallest = _pivots(level * available)
         quality, available = jnp.minimum(quality, smallest), jnp.sum(taken, 0)
         embedding = np.zeros((len(d), orders.size))

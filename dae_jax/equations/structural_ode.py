@@ -138,7 +138,8 @@ class StructuralODE(ManifoldODE):
 
     def highest_of(self, levels: list[Float[Array, " n"]]) -> Float[Array, " n"]:
         """Fᵢ^(Cᵢ) of all the derivatives of F."""
-        return jnp.stack([levels[k][i] for i, k in enumerate(self.orders.equations)])
+        n = self.form.size
+        return take(jnp.concatenate(levels), n * np.array(self.orders.equations) + np.arange(n))
 
     @at_one_instant
     def _system(

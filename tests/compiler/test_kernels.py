@@ -97,6 +97,15 @@ def primitives(fn, *args):
     return [eqn.primitive.name for eqn in jax.make_jaxpr(fn)(*args).eqns]
 
 
+def test_a_large_array_that_a_function_holds_is_not_taken_apart():
+    def of_large(large):
+        return jax.make_jaxpr(scalarise(lambda x: x * jnp.sum(large[0])))(jnp.ones(2)).jaxpr.eqns
+
+    found = []
+    jax.eval_shape(lambda large: found.extend(of_large(large)), jnp.ones((100, 100)))
+    assert len(found) < 100
+
+
 @pytest.mark.parametrize("fn", FUNCTIONS)
 class TestScalarise:
     def test_is_scalar(self, fn):

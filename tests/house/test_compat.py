@@ -39,6 +39,13 @@ class TestPackage:
         if kind != "lax":
             assert jax.grad(loop)(2.0) == 192.0
 
+    def test_a_loop_without_reverse_derivatives(self):
+        turns = lambda x: jax.lax.while_loop(lambda c: c[0] < 5, lambda c: (c[0] + 1, c[1] * x), (0, x))[1]
+        with pytest.raises(ValueError, match="lax.while_loop") as refused:
+            jax.vjp(turns, 2.0)[1](1.0)
+        assert _compat.is_a_loop_without_reverse(refused.value)
+        assert not _compat.is_a_loop_without_reverse(ValueError("another"))
+
     def test_messages_of_results(self):
         assert _compat.messages(RESULTS)[int(RESULTS.successful._value)] == "successful"
         assert "maximum number of solver steps" in _compat.messages(RESULTS)[int(RESULTS.max_steps_reached._value)]

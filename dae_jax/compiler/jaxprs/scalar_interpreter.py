@@ -100,6 +100,8 @@ class ScalarInterpreter(Generic[E]):
     def constant(self, x: Any) -> np.ndarray:
         """A constant as known numbers, or as unknown ones where it is being traced."""
         if isinstance(x, Tracer):
+            if x.size > self.limit:
+                raise Unsupported("too many entries")
             return self.traced(x)
         if is_key(x):
             raise Unsupported("keys are no entries")
