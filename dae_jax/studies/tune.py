@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,8 @@ FEW = 8
 BLOCK = 10
 # Where steps gain nothing any more, as they go to and fro across a valley, they become so many times shorter, and this often.
 SHORTER, LEVELS = 8.0, 2
+
+Map: TypeAlias = Callable[..., Any]
 
 
 class History(NamedTuple):
@@ -124,8 +126,8 @@ def tune(
       mode, else reverse mode, and the other mode where JAX refuses the first. A `daesolve` inside it needs
       `adjoint=diffrax.ForwardMode()` for forward mode.
     - `params`: any pytree of positive numbers: the first start.
-    - `optimiser`: any optax optimiser; by default the gradient clipped to norm 1, then Adam with Nesterov's momentum and a rate
-      that falls from 0.3 to 0.01 along a cosine.
+    - `optimiser`: any optax optimiser, also one that searches along a line (what that evaluates is not counted); by default the gradient
+      clipped to norm 1, then Adam with Nesterov's momentum and a rate that falls from 0.3 to 0.01 along a cosine.
     - `steps`: at most so many. Where within `patience` steps a start has not lowered its loss by a part `tolerance` of it, or of what it
       has lowered it by in all, whichever is less, it goes on from its best point in steps 8 times shorter, twice; ends earlier where
       these gain nothing either, or no step led up.
@@ -169,9 +171,9 @@ def descent(
     if not jax.tree.leaves(params):
         raise ValueError(f"`params` must hold numbers, but is {params}.")
     logs, unravel = ravel_pytree(jax.tree.map(_checked_log, params))
-    if optimiser is None:
-        import optax
+    import optax
 
+    if optimiser is None:
         rate = optax.cosine_decay_schedule(0.3, steps, 0.01 / 0.3)
         # Beside the gradient of a loss in any unit; the square of what is smaller is zero.
         least = float(jnp.finfo(logs.dtype).tiny) ** 0.5
@@ -180,8 +182,12 @@ def descent(
     factors = jax.random.uniform(key, (starts, logs.size), logs.dtype, -1, 1) * jnp.log(spread)
     z = logs + factors.at[0].set(0)
     point_at = lambda z: unravel(jnp.exp(z))
-    derivative, cost = _value_and_gradient(lambda z: loss(point_at(z)), logs)
-    advance = _compiled(derivative, point_at, optimiser, tolerance, patience)
+    value_at = lambda z: loss(point_at(z))
+    derivative, cost = _value_and_gradient(value_at, logs)
+    # Some take the value besides the gradient, or search along a line.
+    update = optax.with_extra_args_support(optimiser).update
+    advice = lambda f, df, state, z: update(df, state, z, value=f, grad=df, value_fn=value_at)
+    advance = _compiled(derivative, point_at, advice, tolerance, patience)
     unknown = jnp.asarray(jnp.inf, z.dtype)
     point = jax.vmap(lambda z: _Point(z, optimiser.init(z), z, unknown, unknown, unknown, 0, False, 0))(z)
     records = []
@@ -234,7 +240,7 @@ def _checked_log(p: Any) -> Any:
     return jnp.log(jnp.asarray(p, jnp.result_type(float, p)))
 
 
-def _value_and_gradient(f: Callable[..., Any], z: Any) -> tuple[Callable[..., Any], int]:
+def _value_and_gradient(f: Map, z: Any) -> tuple[Map, int]:
     """z → (f, ∂f/∂z) in the mode that suits and that JAX allows for f, and its cost in evaluations of f."""
 
     def forward(z: Any) -> Any:
@@ -255,9 +261,7 @@ def _value_and_gradient(f: Callable[..., Any], z: Any) -> tuple[Callable[..., An
     return first
 
 
-def _compiled(
-    derivative: Callable[..., Any], point_at: Callable[..., Any], optimiser: Any, tolerance: float, patience: int
-) -> Callable[..., Any]:
+def _compiled(derivative: Map, point_at: Map, advice: Map, tolerance: float, patience: int) -> Map:
     def step(point: _Point, _: Any) -> tuple[_Point, Any]:
         value, gradient = derivative(point.z)
         params = jax.tree.leaves(point_at(point.z))
@@ -268,7 +272,7 @@ def _compiled(
         first = jnp.where(better & jnp.isinf(point.first), value, point.first)
         enough = lambda value: tolerance * jnp.minimum(first - value, jnp.abs(value))
         improved = better & ~(point.mark - value <= enough(value))
-        update, state = optimiser.update(gradient, point.state, point.z)
+        update, state = advice(value, gradient, point.state, point.z)
         best_z, best = jnp.where(better, point.z, point.best_z), jnp.where(better, value, point.best)
         stale = jnp.where(improved, 0, point.stale + 1)
         tired = stale >= patience
