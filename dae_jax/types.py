@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import diffrax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree, Real
+from typing_extensions import TypeAliasType
 
 
 # Pytrees of the user's, of any structure: his state, (q, v), (x, z) or y, and what he calls `args`.
@@ -35,10 +36,10 @@ Solver: TypeAlias = diffrax.AbstractSolver[Any]
 Controller: TypeAlias = diffrax.AbstractStepSizeController[Any, Any]
 ProgressMeter: TypeAlias = diffrax.AbstractProgressMeter[Any]
 
-# Numbers that a user may write as Python's: of time, and yes or no.
+# Numbers that a user may write as Python's: of time, and yes or no. Signatures show the names.
 if TYPE_CHECKING:
     Time: TypeAlias = float | Array | np.ndarray
     BoolLike: TypeAlias = bool | Array | np.ndarray
 else:
-    Time: TypeAlias = Real[Array, ""] | Real[np.ndarray, ""] | np.number | float | int
-    BoolLike: TypeAlias = Bool[Array, ""] | Bool[np.ndarray, ""] | np.bool_ | bool
+    Time = TypeAliasType("Time", Real[Array, ""] | Real[np.ndarray, ""] | np.number | float | int)
+    BoolLike = TypeAliasType("BoolLike", Bool[Array, ""] | Bool[np.ndarray, ""] | np.bool_ | bool)

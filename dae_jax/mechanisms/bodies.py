@@ -16,7 +16,7 @@ size. Source: P. E. Nikravesh, *Computer-Aided Analysis of Mechanical Systems*, 
 
 import functools
 from collections.abc import Sequence
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -25,14 +25,15 @@ import numpy as np
 from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
+from typing_extensions import TypeAliasType
 
 from ..validate.states import brief
 from .rotations import cross, matrix, moment, plane, rates, rotate, rotate_back
 
 
 GROUND = "ground"
-# A number or an array of them as a user may write it: (0, -9.81) too.
-Numbers: TypeAlias = ArrayLike | Sequence[ArrayLike] | Sequence[Sequence[ArrayLike]]
+# A number or an array of them as a user may write it: (0, -9.81) too. Signatures show the name.
+Numbers = TypeAliasType("Numbers", ArrayLike | Sequence[ArrayLike] | Sequence[Sequence[ArrayLike]])
 
 
 class Pose(NamedTuple):

@@ -91,6 +91,13 @@ class Mechanism(eqx.Module):
                 total = total + load.generalised_force(t, at, args)
         return Coordinates(total, q.names)
 
+    def not_finite_loads(self, t: Time, q: Coordinates, v: Coordinates, args: Args) -> list[str]:
+        """The loads that are NaN or infinite at a state, and why where that is known; errors of a solve say so."""
+        at = self.configuration(q, v)
+        lost = [load for load in self.loads if not jnp.all(jnp.isfinite(load.generalised_force(t, at, args)))]
+        half_a_turn = ", whose angle in space has come to half a turn: its turns are not known beyond"
+        return [f"{load.name!r}{half_a_turn * (isinstance(load, Along) and load.counts_turns)}" for load in lost]
+
     def constraint(self, t: Time, q: Coordinates, args: Args) -> Float[Array, " m"]:
         """g: the equations of lower pairs in their order, then those of other joints, then |e|² = 1 of each body in space."""
         at = self.configuration(q)

@@ -177,16 +177,18 @@ def _statistics(
     square = r @ r
     deviation = jnp.sqrt(square / free)
     variance = 1.0 if known else deviation**2
-    by_value = jnp.where(in_log, 1 / values, 1)
-    covariance = variance * _inverse(found) / (by_value[:, None] * by_value)
-    errors = jnp.sqrt(jnp.diag(covariance))
-    products = jnp.where(errors > 0, errors, jnp.nan)
+    # In units of the columns of J, and one factor after the other: in float32 squares of 1e-23, a molecule's mass, are 0.
+    inverse, unit_of = variance * _inverse(found), jnp.where(in_log, values, 1) / found.scale
+    correlated = jnp.sqrt(jnp.diag(inverse))
+    products = jnp.where(correlated > 0, correlated, jnp.nan)
+    errors = jnp.abs(unit_of) * correlated
+    scaled = jacobian / found.scale
     return Identified(
         params=params,
         standard_errors=unravel(errors.astype(values.dtype)),
-        covariance=covariance,
-        correlation=covariance / (products[:, None] * products),
-        information=by_value[:, None] * by_value * (jacobian.T @ jacobian) / variance,
+        covariance=unit_of[:, None] * inverse * unit_of,
+        correlation=inverse / (products[:, None] * products),
+        information=(scaled.T @ scaled) / (unit_of[:, None] * variance) / unit_of,
         deviation=deviation * unit,
         residuals=r,
         cost=square / 2 * unit**2,
@@ -201,8 +203,8 @@ def _statistics(
 
 
 def _inverse(found: Factors) -> Float[Array, "p p"]:
-    """(JᵀJ)⁻¹; of parameters in a combination that is not seen ∞, and NaN beside others."""
-    seen, v = found.seen > 0, found.vt.T / found.scale[:, None]
+    """(JᵀJ)⁻¹ in units of J's columns; of parameters in a combination that is not seen ∞, and NaN beside others."""
+    seen, v = found.seen > 0, found.vt.T
     inverse = (v * jnp.where(seen, 1 / jnp.where(seen, found.s, 1) ** 2, 0)) @ v.T
     half = jnp.sqrt(jnp.finfo(found.s.dtype).eps)
     lost = jnp.any(~seen[:, None] & (jnp.abs(found.vt) > half), 0)

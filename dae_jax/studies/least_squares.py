@@ -75,8 +75,10 @@ def factors(jacobian: Jacobian, scale: Float[Array, " p"] | None = None) -> Fact
 
 
 def lengths(jacobian: Jacobian) -> Float[Array, " p"]:
-    """Those of its columns."""
-    return jnp.sqrt(jnp.sum(jacobian**2, 0))
+    """Those of its columns. In float32 the square of 1e20, as of a derivative by a molecule's mass, would be infinite."""
+    largest = jnp.max(jnp.abs(jacobian), 0, initial=0)
+    unit = jnp.where(largest > 0, largest, 1)
+    return unit * jnp.linalg.norm(jacobian / unit, axis=0)
 
 
 class _Linearised(eqx.Module):

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,10 @@ if TYPE_CHECKING:  # half of the time that importing the library takes beyond di
 FEW = 8
 # So many steps are one compiled call.
 BLOCK = 10
+# Where steps gain nothing any more, as they go to and fro across a valley, they become so many times shorter, and this often.
+SHORTER, LEVELS = 8.0, 2
+
+Map: TypeAlias = Callable[..., Any]
 
 
 class History(NamedTuple):
@@ -79,7 +83,9 @@ class Tuned(NamedTuple):
 
 
 class _Point(NamedTuple):
-    """Where a descent is. `first`: the first finite loss; `mark`: the best when it was last lower by enough, `stale` steps ago."""
+    """Where a descent is. `first`: the first finite loss; `mark`: the best when it was last lower by enough, `stale` steps ago; `rough`:
+    whether it has gone up since; `level`: how often its steps have become shorter.
+    """
 
     z: Float[Array, " parameters"]
     state: Any
@@ -88,6 +94,8 @@ class _Point(NamedTuple):
     first: Float[Array, ""]
     mark: Float[Array, ""]
     stale: Any
+    rough: Any
+    level: Any
 
 
 @at_ease
@@ -118,10 +126,11 @@ def tune(
       mode, else reverse mode, and the other mode where JAX refuses the first. A `daesolve` inside it needs
       `adjoint=diffrax.ForwardMode()` for forward mode.
     - `params`: any pytree of positive numbers: the first start.
-    - `optimiser`: any optax optimiser; by default the gradient clipped to norm 1, then Adam with Nesterov's momentum and a rate
-      that falls from 0.3 to 0.01 along a cosine.
-    - `steps`: at most so many; ends earlier where within `patience` steps no start has lowered its loss by a part `tolerance` of it, or
-      of what it has lowered it by in all, whichever is less.
+    - `optimiser`: any optax optimiser, also one that searches along a line (what that evaluates is not counted); by default the gradient
+      clipped to norm 1, then Adam with Nesterov's momentum and a rate that falls from 0.3 to 0.01 along a cosine.
+    - `steps`: at most so many. Where within `patience` steps a start has not lowered its loss by a part `tolerance` of it, or of what it
+      has lowered it by in all, whichever is less, it goes on from its best point in steps 8 times shorter, twice; ends earlier where
+      these gain nothing either, or no step led up.
     - `starts`: how many descents run at once, batched. The others begin at `params` times factors drawn from
       1/`spread` to `spread`, uniformly in the logarithm, with `key`.
     - `progress`: whether a bar is shown on stderr.
@@ -162,9 +171,9 @@ def descent(
     if not jax.tree.leaves(params):
         raise ValueError(f"`params` must hold numbers, but is {params}.")
     logs, unravel = ravel_pytree(jax.tree.map(_checked_log, params))
-    if optimiser is None:
-        import optax
+    import optax
 
+    if optimiser is None:
         rate = optax.cosine_decay_schedule(0.3, steps, 0.01 / 0.3)
         # Beside the gradient of a loss in any unit; the square of what is smaller is zero.
         least = float(jnp.finfo(logs.dtype).tiny) ** 0.5
@@ -173,10 +182,14 @@ def descent(
     factors = jax.random.uniform(key, (starts, logs.size), logs.dtype, -1, 1) * jnp.log(spread)
     z = logs + factors.at[0].set(0)
     point_at = lambda z: unravel(jnp.exp(z))
-    derivative, cost = _value_and_gradient(lambda z: loss(point_at(z)), logs)
-    advance = _compiled(derivative, point_at, optimiser, tolerance)
+    value_at = lambda z: loss(point_at(z))
+    derivative, cost = _value_and_gradient(value_at, logs)
+    # Some take the value besides the gradient, or search along a line.
+    update = optax.with_extra_args_support(optimiser).update
+    advice = lambda f, df, state, z: update(df, state, z, value=f, grad=df, value_fn=value_at)
+    advance = _compiled(derivative, point_at, advice, tolerance, patience)
     unknown = jnp.asarray(jnp.inf, z.dtype)
-    point = jax.vmap(lambda z: _Point(z, optimiser.init(z), z, unknown, unknown, unknown, 0))(z)
+    point = jax.vmap(lambda z: _Point(z, optimiser.init(z), z, unknown, unknown, unknown, 0, False, 0))(z)
     records = []
     with Progress("tune", steps, progress) as shown:
         for done in range(0, steps, BLOCK):
@@ -187,7 +200,7 @@ def descent(
                 raise ValueError(
                     f"`loss` or its gradient is not finite at any of the first {min(BLOCK, steps)} points."
                 )
-            settled = int(jnp.min(point.stale)) >= patience
+            settled = int(jnp.min(point.level)) > LEVELS
             shown.total = min(done + BLOCK, steps) if settled else steps
             shown.show(min(done + BLOCK, steps), f"best {best:.6g}{settled * ', settled'}")
             history = History(*jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x, axis=1)), *records))
@@ -227,7 +240,7 @@ def _checked_log(p: Any) -> Any:
     return jnp.log(jnp.asarray(p, jnp.result_type(float, p)))
 
 
-def _value_and_gradient(f: Callable[..., Any], z: Any) -> tuple[Callable[..., Any], int]:
+def _value_and_gradient(f: Map, z: Any) -> tuple[Map, int]:
     """z → (f, ∂f/∂z) in the mode that suits and that JAX allows for f, and its cost in evaluations of f."""
 
     def forward(z: Any) -> Any:
@@ -248,9 +261,7 @@ def _value_and_gradient(f: Callable[..., Any], z: Any) -> tuple[Callable[..., An
     return first
 
 
-def _compiled(
-    derivative: Callable[..., Any], point_at: Callable[..., Any], optimiser: Any, tolerance: float
-) -> Callable[..., Any]:
+def _compiled(derivative: Map, point_at: Map, advice: Map, tolerance: float, patience: int) -> Map:
     def step(point: _Point, _: Any) -> tuple[_Point, Any]:
         value, gradient = derivative(point.z)
         params = jax.tree.leaves(point_at(point.z))
@@ -259,17 +270,24 @@ def _compiled(
         better = fine & (value < point.best)
         # The first finite loss is lower by any measure.
         first = jnp.where(better & jnp.isinf(point.first), value, point.first)
-        improved = better & ~(point.mark - value <= tolerance * jnp.minimum(first - value, jnp.abs(value)))
-        update, state = optimiser.update(gradient, point.state, point.z)
+        enough = lambda value: tolerance * jnp.minimum(first - value, jnp.abs(value))
+        improved = better & ~(point.mark - value <= enough(value))
+        update, state = advice(value, gradient, point.state, point.z)
         best_z, best = jnp.where(better, point.z, point.best_z), jnp.where(better, value, point.best)
+        stale = jnp.where(improved, 0, point.stale + 1)
+        tired = stale >= patience
+        rough = ~improved & (point.rough | ~(value - best <= enough(best)))
+        onward = jnp.where(fine, point.z + SHORTER**-point.level * update, (point.z + best_z) / 2)
         after = _Point(
-            jnp.where(fine, point.z + update, (point.z + best_z) / 2),
+            jnp.where(tired, best_z, onward),
             jax.tree.map(lambda a, b: jnp.where(fine, a, b), state, point.state),
             best_z,
             best,
             first,
             jnp.where(improved, value, point.mark),
-            jnp.where(improved, 0, point.stale + 1),
+            jnp.where(tired, 0, stale),
+            rough & ~tired,
+            point.level + jnp.where(tired, jnp.where(rough, 1, LEVELS + 1), 0),
         )
         return after, (value, best, point_at(point.z), jnp.linalg.norm(gradient))
 

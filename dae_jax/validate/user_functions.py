@@ -301,6 +301,9 @@ def not_finite(system: System, t: Time, state: State, args: Args, when: str = "a
     if not bad:
         return ""
     reason = "; `args` holds NaN or infinity" if not _all_finite(args) else ""
+    # What has made the force may know of which part it is.
+    parts = getattr(getattr(getattr(system, "force", None), "__self__", None), "not_finite_loads", None)
+    reason += "".join(f"; so is {part}" for part in (parts(t, *state, args) if parts else []))
     return f"`{'`, `'.join(bad)}` {'is' if len(bad) == 1 else 'are'} not finite {when}{reason}."
 
 

@@ -225,6 +225,22 @@ def test_work_precision_is_drawn_where_there_is_a_reference():
     assert not dict(figures.figures(scene, [], [], {}, 1e-8, paper=False))
 
 
+@pytest.mark.parametrize("highest", [2e-3, 8e-3, 7e-2, 1.0, 1e3])
+def test_numbers_along_an_axis_are_not_on_top_of_each_other(highest):
+    """Run times from 1 to 70 ms had 2, 3, 4 and 6 times a power of ten, each over the next."""
+    times = np.geomspace(1.2e-3, highest, 4)
+    for figure in (
+        plotting.work_precision({"rattle": (times, times)}),
+        plotting.scaling({"a": (times, times)}, "n", "s"),
+    ):
+        figure.draw_without_rendering()
+        axis = figure.axes[0].xaxis
+        boxes = [label.get_window_extent() for label in axis.get_ticklabels(which="both") if label.get_text()]
+        low, high = axis.get_view_interval()
+        assert np.sum((axis.get_ticklocs() >= low) & (axis.get_ticklocs() <= high)) >= 1
+        assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
+
+
 def test_other_tolerances_compile_nothing(nothing_forgotten):
     scene = SCENES["pendulum"]()
     times = scene.times(0.1, 5)

@@ -1,12 +1,16 @@
 """What parameters are called: how many are of any type, and how many of these are pytrees of the user's."""
 
 import ast
+import inspect
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+import dae_jax
+from dae_jax import mechanisms
 
 
 PACKAGE = Path(__file__).parents[2] / "dae_jax"
@@ -84,3 +88,13 @@ def test_shapes_and_types_are_as_the_annotations_say():
         [sys.executable, "-m", "tests.checked_shapes"], cwd=PACKAGE.parent, capture_output=True, text=True
     )
     assert ran.returncode == 0, ran.stderr[-3000:]
+
+
+@pytest.mark.parametrize("module", [dae_jax, mechanisms], ids=["dae_jax", "mechanisms"])
+def test_signatures_show_the_names_of_types(module):
+    """Help on `distance` began with 2,200 letters, most of what a number may be."""
+    for name in sorted(vars(module)):
+        function = getattr(module, name)
+        if inspect.isfunction(function) and not name.startswith("_"):
+            annotations = [str(p.annotation) for p in inspect.signature(function).parameters.values()]
+            assert max(map(len, annotations), default=0) <= 160, (name, max(annotations, key=len))

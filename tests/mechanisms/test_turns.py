@@ -47,8 +47,15 @@ def test_a_spring_fails_at_half_a_turn_and_is_right_before():
     np.testing.assert_allclose(
         mechanism.coordinate(solve(0.3), "hinge"), rate / frequency * np.sin(0.3 * frequency), rtol=1e-7
     )
-    with pytest.raises(RuntimeError):
+    with pytest.raises(RuntimeError, match="so is 'spring on hinge', whose angle in space has come to half a turn"):
         solve(1.5)
+
+
+def test_a_load_that_is_not_finite_is_named():
+    late = m.motor(HINGE, torque=lambda t, c, rate, args: jnp.sqrt(0.1 - t), name="drive")
+    mechanism = m.Mechanism([ROD], [HINGE], [m.gravity((0, -9.81, 0)), late, m.spring(HINGE, 1.0)])
+    with pytest.raises(RuntimeError, match=r"not finite just beyond t = \S+; so is 'drive'\."):
+        dae_jax.daesolve(mechanism.system(), SOLVER, 0.0, 0.5, None, mechanism.assemble())
 
 
 @pytest.mark.parametrize("axis", [(0, 0, 1), (1, 2, -2)])

@@ -33,6 +33,24 @@ GUESS = {"size": 1.0, "rate": 3.0, "offset": 1.0}
 # Against closed forms
 
 
+@pytest.mark.parametrize("positive", [True, False])
+@pytest.mark.parametrize("unit", [1e-30, 1e-23, 1e23, 1e30])
+def test_a_parameter_whose_square_is_no_number_has_its_standard_error(unit, positive):
+    """In float32 a molecule's mass was 1.5e-23 ± 0, or not determined, and 1e23 of them ± inf: squares were 0 or infinite."""
+    times, unit = jnp.linspace(0, 2, 30, dtype=jnp.float32), jnp.float32(unit)
+
+    def found(unit):
+        model = lambda p: p["mass"] / unit * jnp.exp(-p["rate"] * times)
+        data = np.float32(1.5 * np.exp(-0.7 * np.asarray(times)) + 0.01 * NOISE)
+        start = {"mass": 1.3 * unit, "rate": jnp.float32(1.0)}
+        return dae_jax.identify(model, start, data, np.float32(0.01), positive=positive)
+
+    expected, given = found(jnp.float32(1)), found(unit)
+    np.testing.assert_allclose(given.params["mass"] / unit, expected.params["mass"], rtol=1e-4)
+    np.testing.assert_allclose(given.standard_errors["mass"] / unit, expected.standard_errors["mass"], rtol=1e-4)
+    np.testing.assert_allclose(given.correlation, expected.correlation, atol=1e-4)
+
+
 @pytest.mark.parametrize("sigma", [None, 0.1, np.geomspace(0.01, 1, 30)], ids=["estimated", "one", "many"])
 def test_of_a_linear_model_all_is_that_of_the_normal_equations(sigma):
     given = 0.1 if sigma is None else sigma

@@ -92,6 +92,21 @@ def test_plateau_ends_the_descent():
     assert tuned.history.loss.shape[1] <= 40
 
 
+@pytest.mark.parametrize("steps", [100, 300, 3000])
+def test_steps_to_and_fro_across_a_valley_are_no_end(steps):
+    """Of 200 steps and more the first are long, and led to and fro: 0.001 and settled, where 100 had led to 1e-32."""
+    tuned = dae_jax.tune(lambda p: (p["a"] * p["b"] - 2) ** 2, {"a": 1.0, "b": 5.0}, steps=steps, progress=False)
+    assert tuned.loss < 1e-20
+    assert tuned.history.loss.shape[1] <= 220
+
+
+@pytest.mark.parametrize("optimiser", [optax.lbfgs(), optax.polyak_sgd()], ids=["lbfgs", "polyak"])
+def test_optimisers_that_take_the_value_too(optimiser):
+    """They ended in optax with missing keyword arguments."""
+    loss = lambda p: (p["a"] * p["b"] - 2) ** 2
+    assert dae_jax.tune(loss, {"a": 1.0, "b": 5.0}, optimiser, steps=60, progress=False).loss < 1e-6
+
+
 def test_steps_that_are_no_multiple_of_a_block():
     assert dae_jax.tune(lambda p: p, 2.0, steps=13, progress=False).history.loss.shape == (1, 13)
 

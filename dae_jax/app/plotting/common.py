@@ -38,6 +38,8 @@ METHODS = {
     "radau-variable": ("#785870", "H"),
     "bdf": ("#5200F8", "1"),
 }
+# So far apart are the ends of an axis on which there is room for three ticks a decade.
+FEW_DECADES = 300
 GREY = "#999999"
 BLANK = "#DDDDDD"
 # The files that a figure can be saved as.
@@ -69,6 +71,19 @@ def figure_around(x: np.ndarray, y: np.ndarray, largest: float = 5.4) -> tuple[A
     figure, axes = figure_of(max(scale * width, 2.4) + 0.9, max(scale * height, 1.2) + 1.4)
     axes.set(xlim=(left - margin, right + margin), ylim=(low - margin, high + margin), aspect="equal")
     return figure, axes
+
+
+def tick_few_decades(axis: Any) -> None:
+    """A logarithmic axis of few decades has ticks at 1, 2 and 5 times the powers of ten: by default it has all of them from 2 to 6, on
+    top of each other.
+    """
+    from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
+
+    low, high = axis.get_view_interval()
+    if high < FEW_DECADES * low:
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.set_major_formatter(FormatStrFormatter("%g"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def legend_beside(figure: Any, handles: Sequence[Any] | None = None) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import PyTree
 
-from .common import COLOURS, GREY, Curves, figure_of, legend_below, legend_beside, look, saved
+from .common import COLOURS, GREY, Curves, figure_of, legend_below, legend_beside, look, saved, tick_few_decades
 
 
 def drift(curves: Curves, title: str = "Drift off the constraints", unit: str = "", violated: str = "g") -> Any:
@@ -59,6 +59,7 @@ def drift_growth(curves: Curves, title: str = "", unit: str = "", power: int = 2
         late = t > t[-1] / 30
         axes.loglog(t[late], guide[late], "--", color=GREY, linewidth=1, label=None if i else f"∝ time$^{power}$")
     axes.set(xlabel="time in s", ylabel=f"max |g|{unit and ' in ' + unit}", title=title)
+    tick_few_decades(axes.xaxis)
     legend_below(figure, 4)
     return figure
 
@@ -109,6 +110,7 @@ def work_precision(points: Mapping[str, tuple[Sequence[float], Sequence[float]]]
     axes.set(xlabel="run time in s", ylabel="largest error against the reference", title=title)
     if axes.get_ylim()[1] > 2:
         axes.set_ylim(top=2)
+    tick_few_decades(axes.xaxis)
     legend_beside(figure)
     return figure
 
@@ -119,6 +121,8 @@ def scaling(curves: Curves, size: str, quantity: str, title: str = "") -> Any:
     for i, (label, (x, y)) in enumerate(curves.items()):
         axes.loglog(x, y, label=label, **look(label, i))
     axes.set(xlabel=size, ylabel=quantity, title=title)
+    tick_few_decades(axes.xaxis)
+    tick_few_decades(axes.yaxis)
     legend_beside(figure)
     return figure
 
