@@ -87,7 +87,13 @@ class DenseNormals:
             return self.gram_solve(ode, normals, b)
         # Which constraints depend on each other has nothing to do with their scale.
         gram, scale = normals[2:4]
-        return scale * semidefinite_solve(gram, scale * b, self.rank[1])
+        count, columns = len(gram), jnp.concatenate([(scale * b)[:, None], gram], 1)
+        solved = semidefinite_solve(gram, columns, self.rank[1])
+        some, held = scale * solved[:, 0], solved[:, 1:]
+        # How long an x is has. Of those that move nothing, as much is taken away as lies along them.
+        idle = scale[:, None] * (jnp.eye(count, dtype=gram.dtype) - held)
+        along = semidefinite_solve(_matmul(idle.T, idle), matvec(idle.T, some), count - self.rank[1])
+        return some - matvec(idle, along)
 
     @staticmethod
     def independent(normals: Normals) -> Float[Array, " c"]:

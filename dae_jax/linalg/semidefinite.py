@@ -31,7 +31,7 @@ def semidefinite_solve(
     """
     m = s.shape[0]
     if rank is not None and rank < m:
-        return _minimum_norm(s, b, rank)
+        return jnp.dot(_pseudo_inverse(s, rank), b)
     if m > LOOPED:
         factor = jax.scipy.linalg.cho_factor(s, lower=True)
         return jax.scipy.linalg.cho_solve(factor, b)
@@ -83,27 +83,24 @@ def _sum(terms: Iterable[Array]):
     return sum(terms[1:], terms[0]) if terms else 0.0
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
-def _minimum_norm(s: Float[Array, "m m"], b: Float[Array, "m *k"], rank: int) -> Float[Array, "m *k"]:
-    return jnp.dot(_pseudo_inverse(s, rank), b)
-
-
-@_minimum_norm.defjvp
-def _(rank: int, primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
-    # Of constant rank: Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973), eq. 4.12, for symmetric S.
-    (s, b), (ds, db) = primals, tangents
-    inverse = _pseudo_inverse(s, rank)
-    x = jnp.dot(inverse, b)
-    residual = b - jnp.dot(s, x)
-    into_null_space = jnp.dot(ds, jnp.dot(inverse, x))
-    dx = jnp.dot(inverse, db - jnp.dot(ds, x) + jnp.dot(inverse, jnp.dot(ds, residual)))
-    return x, dx + into_null_space - jnp.dot(inverse, jnp.dot(s, into_null_space))
-
-
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
 def _pseudo_inverse(s: Float[Array, "m m"], rank: int) -> Float[Array, "m m"]:
+    """S⁺ of symmetric S of constant rank. Its derivatives, of any order, are in terms of S⁺: those of eigenvectors, of which there are
+    none where eigenvalues are equal, are not in them.
+    """
     values, vectors = jnp.linalg.eigh(s)
     if rank:
         least = 8 * s.shape[0] * float(jnp.finfo(s.dtype).eps) * values[-1]
         values = jnp.where(values[s.shape[0] - rank] > least, values, jnp.nan)
     values, vectors = values[s.shape[0] - rank :], vectors[:, s.shape[0] - rank :]
     return jnp.dot(vectors / values, vectors.T)
+
+
+@_pseudo_inverse.defjvp
+def _(rank: int, primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> Any:
+    # Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973), eq. 4.12, for symmetric S.
+    (s,), (ds,) = primals, tangents
+    inverse = _pseudo_inverse(s, rank)
+    beyond = jnp.eye(s.shape[0], dtype=s.dtype) - jnp.dot(s, inverse)
+    into_null_space = jnp.dot(beyond.T, jnp.dot(ds, jnp.dot(inverse, inverse)))
+    return inverse, into_null_space + into_null_space.T - jnp.dot(inverse, jnp.dot(ds, inverse))

@@ -132,6 +132,11 @@ def test_redundant_constraints_give_multipliers_of_least_norm():
     assert b.rank == 3
     few, many = (np.asarray(dae_jax.multipliers(s.system, x))[0] for s, x in ((plain, a), (redundant, b)))
     assert np.linalg.norm(many) < np.linalg.norm(few)
+    # In the range of G, that is G G⁺λ = λ, at masses that are not equal.
+    constraint = redundant.system.constraint
+    assert constraint is not None
+    g = np.asarray(jax.jacfwd(lambda q: constraint(0.0, q, redundant.args))(jnp.asarray(redundant.y0[0])))
+    np.testing.assert_allclose(g @ np.linalg.pinv(g) @ many, many, rtol=1e-10)
 
 
 def test_a_chart_has_a_coordinate_for_each_independent_constraint_less():

@@ -118,3 +118,15 @@ def test_third_derivatives_are_forward_ones():
     np.testing.assert_allclose(jax.jacfwd(jax.hessian(of))(X), jax.jacfwd(jax.hessian(plain))(X), rtol=1e-12)
     with pytest.raises(NotImplementedError, match="ForwardMode"):
         jax.jacrev(jax.hessian(of))(X)
+
+
+def test_multipliers_of_redundant_constraints_where_eigenvalues_are_equal():
+    """Two pendulums that are alike, each rod written twice: λ = (|v|² + q·f) / (2|q|²). Eigenvectors have no derivative there."""
+    force = jnp.array([0.0, 9.81])
+    rods = lambda t, q, args: jnp.repeat((jnp.sum(q**2, 1) - 1) / 2, 2)
+    system = dae_jax.ConstrainedSystem(lambda t, q, v, args: jnp.tile(force, (2, 1)), rods, rank=2)
+    found = lambda y: dae_jax.multipliers(system, 0.0, *y)
+    exact = lambda y: jnp.repeat((jnp.sum(y[1] ** 2, 1) + y[0] @ force) / (2 * jnp.sum(y[0] ** 2, 1)), 2)
+    y = jnp.array([[[0.6, 0.8], [0.6, 0.8]], [[0.8, -0.6], [0.8, -0.6]]])
+    for derivative in (jax.hessian, lambda f: jax.jacfwd(jax.hessian(f))):
+        np.testing.assert_allclose(jax.jit(derivative(found))(y), derivative(exact)(y), rtol=0, atol=1e-10)
