@@ -29,6 +29,11 @@ from .constraint_jacobian import (
 from .manifold_ode import Feedback, ManifoldODE, Normals, at_one_instant
 
 
+# From so many constraints on the forces of multipliers are found by reverse derivatives, at the price of the constraints. Of fewer by
+# forward ones, which take no longer then, and which a branch that is not taken cannot make NaN.
+REVERSE_FROM = 8
+
+
 def allowed_contradiction(dtype: DType) -> float:
     """The part of the accelerations that dependent constraints ask for in which they may disagree."""
     return max(1e-6, float(jnp.finfo(dtype).eps) ** 0.5)
@@ -154,18 +159,12 @@ class MechanicalODE(ManifoldODE):
         return jnp.concatenate(rows) if len(rows) > 1 else rows[0]
 
     def reaction(self, t: Time, q: Float[Array, " n"], v: Float[Array, " n"], multipliers: Flat) -> Float[Array, " n"]:
-        """Aᵀ(λ, μ), or Gᵀλ of so many: by reverse derivatives, which take no longer than the constraints, where there are such."""
+        """Aᵀ(λ, μ), or Gᵀλ of so many."""
+        if self.holonomic + self.nonholonomic < REVERSE_FROM:
+            return jnp.sum(multipliers[:, None] * self.constraint_jacobian(t, q, v)[: multipliers.size], 0)
         of_positions, of_velocities = functools.partial(self.constraint, t), functools.partial(self._nonholonomic, t, q)
         parts = [(of_positions, q, multipliers[: self.holonomic]), (of_velocities, v, multipliers[self.holonomic :])]
-        try:
-            forces = [jax.vjp(function, at)[1](along)[0] for function, at, along in parts if along.size]
-        except ValueError as error:
-            if not (lacks_reverse_derivatives(error) or is_a_loop_without_reverse(error)):
-                raise
-            forces = [
-                jnp.sum(along[:, None] * jax.jacfwd(function)(at), 0) for function, at, along in parts if along.size
-            ]
-        return sum(forces, jnp.zeros_like(q))
+        return sum((_times_jacobian(*part) for part in parts if part[2].size), jnp.zeros_like(q))
 
     def bias(self, t: Time, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " mp"]:
         """γ, the second derivative of g and the first of h where v̇ = 0."""
@@ -349,3 +348,13 @@ def _outline(function: Callable[..., Any] | None, *args: PyTree) -> tuple[int, b
     variable = jaxpr.jaxpr.invars[0]
     used = any(variable is v for eqn in jaxpr.jaxpr.eqns for v in eqn.invars) or variable in jaxpr.jaxpr.outvars
     return int(sum(np.prod(o.shape) for o in jax.tree.leaves(out))), used
+
+
+def _times_jacobian(function: Callable[[Flat], Flat], at: Flat, along: Flat) -> Any:
+    """lᵀ ∂f/∂x, in reverse where the function has such derivatives."""
+    try:
+        return jax.vjp(function, at)[1](along)[0]
+    except ValueError as error:
+        if not (lacks_reverse_derivatives(error) or is_a_loop_without_reverse(error)):
+            raise
+        return jnp.sum(along[:, None] * jax.jacfwd(function)(at), 0)
