@@ -25,6 +25,7 @@ def main() -> None:
         (scenes.jay(), dae_jax.OrthogonalProjection(dae_jax.DOP853()), None, None),
         (scenes.capacitor_loop(), dae_jax.RadauIIA5(), None, None),
         (scenes.car_axis(), dae_jax.BDF(), dae_jax.GGL(), None),
+        (scenes.chain(9), dae_jax.RadauIIA5(), None, None),
     ]
     for scene, solver, formulation, step in cases:
         sol = dae_jax.daesolve(

@@ -158,7 +158,7 @@ class MechanicalODE(ManifoldODE):
             rows.append(jax.jacfwd(self._nonholonomic, 2)(t, q, v))
         return jnp.concatenate(rows) if len(rows) > 1 else rows[0]
 
-    def reaction(self, t: Time, q: Float[Array, " n"], v: Float[Array, " n"], multipliers: Flat) -> Float[Array, " n"]:
+    def reaction(self, t: Time, q: Float[Array, " n"], v: Float[Array, " n"], multipliers: Float[Array, " k"]) -> Any:
         """Aᵀ(λ, μ), or Gᵀλ of so many."""
         if self.holonomic + self.nonholonomic < REVERSE_FROM:
             return jnp.sum(multipliers[:, None] * self.constraint_jacobian(t, q, v)[: multipliers.size], 0)
@@ -350,7 +350,7 @@ def _outline(function: Callable[..., Any] | None, *args: PyTree) -> tuple[int, b
     return int(sum(np.prod(o.shape) for o in jax.tree.leaves(out))), used
 
 
-def _times_jacobian(function: Callable[[Flat], Flat], at: Flat, along: Flat) -> Any:
+def _times_jacobian(function: Callable[[Flat], Array], at: Flat, along: Float[Array, " k"]) -> Any:
     """lᵀ ∂f/∂x, in reverse where the function has such derivatives."""
     try:
         return jax.vjp(function, at)[1](along)[0]
