@@ -283,10 +283,12 @@ def precision_of(dtype: DType, controller: diffrax.AbstractStepSizeController) -
         return f"{np.dtype(dtype)}, fixed steps"
     given = {name: getattr(controller, name, None) for name in ("rtol", "atol")}
     numbers = [f"{name} {value:g}" for name, value in given.items() if isinstance(value, float | int)]
-    each = [
-        f"{name} for each unknown" for name, value in given.items() if jax.tree.leaves(jax.tree.map(jnp.shape, value))
-    ]
+    each = [f"{name} for each unknown" for name, value in given.items() if _is_one_each(value)]
     return ", ".join([str(np.dtype(dtype)), *numbers, *each])
+
+
+def _is_one_each(tolerance: PyTree) -> bool:
+    return not jax.tree_util.all_leaves([tolerance]) or jnp.ndim(tolerance) > 0
 
 
 @jax.jit

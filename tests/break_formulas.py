@@ -225,7 +225,7 @@ BREAKS = {
         f"{_FORMULAS}::test_multipliers_of_unequal_masses",
     ),
     "residual: sign of λ": Break(
-        "equations/residual_form.py", "ode.force(t, q, v) + ode.reaction(", "ode.force(t, q, v) - ode.reaction(",
+        "equations/residual_form.py", "ode.force(t, q, v) + pull(", "ode.force(t, q, v) - pull(",
         f"{_FORMULAS}::test_residual_forms_of_unequal_masses",
     ),
     "Taylor: no factorial": Break(

@@ -120,7 +120,7 @@ def below_roundoff(sol: DAESolution, controller: diffrax.AbstractStepSizeControl
     each = zip(*map(jax.tree.leaves, (state, *tolerances)), strict=True)
     whole = [np.stack(np.broadcast_arrays(np.abs(x), *of)).reshape(3, -1) for x, *of in each]
     size, rtol, atol = np.concatenate(whole, 1)
-    eps = float(np.finfo(size.dtype).eps)
+    eps = float(np.finfo(jnp.result_type(*jax.tree.leaves(state))).eps)
     below = rtol * size + atol < eps * size
     if not np.any(below):
         return ""

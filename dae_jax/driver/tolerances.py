@@ -39,9 +39,9 @@ def with_tolerances(controller: Controller, state: State) -> Any:
         return controller
     known = [x for x in jax.tree.leaves(given) if not isinstance(x, Tracer)]
     if all(isinstance(x, NUMBERS) for x in known) and all(np.all(np.asarray(x) >= 0) for x in known):
-        whole = [x if _is_number(x) else _in_structure(name, x, state) for name, x in zip(NAMES, given, strict=True)]
-        if all(map(_may_be_positive, *(jax.tree.leaves(spread(x, state)) for x in whole))):
-            return dataclasses.replace(controller, rtol=whole[0], atol=whole[1])
+        whole = changed(controller, lambda name, x: _in_structure(name, x, state))
+        if all(map(_may_be_positive, *(jax.tree.leaves(of_state(whole, name, state)) for name in NAMES))):
+            return whole
     raise ValueError(
         "`stepsize_controller` must have positive tolerances, numbers or one for each unknown, but has "
         f"rtol = {brief(given[0])} and atol = {brief(given[1])}: write PIDController(rtol=1e-6, atol=1e-6)."
@@ -164,11 +164,7 @@ class StepsOfVector(AbstractStepsOf):
 
 def of_state(controller: Controller, name: str, state: State) -> Any:
     """The tolerances in the structure of the state; 0 where steps are fixed."""
-    return spread(getattr(controller, name, 0.0), state)
-
-
-def spread(tolerance: PyTree, state: State) -> Any:
-    """One that is a number for each array of the state."""
+    tolerance = getattr(controller, name, 0.0)
     return jax.tree.map(lambda _: tolerance, state) if _is_number(tolerance) else tolerance
 
 

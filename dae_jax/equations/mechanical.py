@@ -158,13 +158,19 @@ class MechanicalODE(ManifoldODE):
             rows.append(jax.jacfwd(self._nonholonomic, 2)(t, q, v))
         return jnp.concatenate(rows) if len(rows) > 1 else rows[0]
 
-    def reaction(self, t: Time, q: Float[Array, " n"], v: Float[Array, " n"], multipliers: Float[Array, " k"]) -> Any:
-        """Aᵀ(λ, μ), or Gᵀλ of so many."""
+    def reaction(self, t: Time, q: Float[Array, " n"], v: Float[Array, " n"]) -> Callable[[Flat], Array]:
+        """(λ, μ) ↦ Aᵀ(λ, μ), and λ ↦ Gᵀλ of as many numbers as there are holonomic constraints."""
         if self.holonomic + self.nonholonomic < REVERSE_FROM:
-            return jnp.sum(multipliers[:, None] * self.constraint_jacobian(t, q, v)[: multipliers.size], 0)
-        of_positions, of_velocities = functools.partial(self.constraint, t), functools.partial(self._nonholonomic, t, q)
-        parts = [(of_positions, q, multipliers[: self.holonomic]), (of_velocities, v, multipliers[self.holonomic :])]
-        return sum((_times_jacobian(*part) for part in parts if part[2].size), jnp.zeros_like(q))
+            return _transposed(self.constraint_jacobian(t, q, v))
+        maps = [_transposed_jacobian(functools.partial(self.constraint, t), q)] if self.holonomic else []
+        maps += [_transposed_jacobian(functools.partial(self._nonholonomic, t, q), v)] if self.nonholonomic else []
+
+        def pull(multipliers: Flat) -> Array:
+            parts = jnp.split(multipliers, [self.holonomic]) if len(maps) > 1 else [multipliers]
+            forces = (along(part) for along, part in zip(maps, parts, strict=True) if part.size)
+            return sum(forces, jnp.zeros_like(q))
+
+        return pull
 
     def bias(self, t: Time, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " mp"]:
         """γ, the second derivative of g and the first of h where v̇ = 0."""
@@ -350,11 +356,18 @@ def _outline(function: Callable[..., Any] | None, *args: PyTree) -> tuple[int, b
     return int(sum(np.prod(o.shape) for o in jax.tree.leaves(out))), used
 
 
-def _times_jacobian(function: Callable[[Flat], Array], at: Flat, along: Float[Array, " k"]) -> Any:
-    """lᵀ ∂f/∂x, in reverse where the function has such derivatives."""
+def _transposed(a: Float[Array, "c n"]) -> Callable[[Flat], Array]:
+    return lambda along: jnp.sum(along[:, None] * a[: along.size], 0)
+
+
+def _transposed_jacobian(function: Callable[[Flat], Array], at: Flat) -> Callable[[Flat], Array]:
+    """l ↦ lᵀ ∂f/∂x, in reverse where the function has such derivatives."""
     try:
-        return jax.vjp(function, at)[1](along)[0]
+        value, pull_back = jax.vjp(function, at)
+        # A loop says so only then.
+        jax.eval_shape(pull_back, value)
     except ValueError as error:
         if not (lacks_reverse_derivatives(error) or is_a_loop_without_reverse(error)):
             raise
-        return jnp.sum(along[:, None] * jax.jacfwd(function)(at), 0)
+        return _transposed(jax.jacfwd(function)(at))
+    return lambda along: pull_back(along)[0]

@@ -26,6 +26,8 @@ FAR = 6
 COARSE = 1e-3
 # In digits of the largest of all numbers, what may be round-off of each that is computed along with it.
 ALONG = 100
+# The smallest and the largest of the tolerances of all unknowns.
+Span: TypeAlias = tuple[Time, Time]
 
 
 def mass_is_regular(ode: MechanicalODE, q: Float[Array, " n"], invertible: bool) -> Bool[Array, ""]:
@@ -252,10 +254,6 @@ def _gram(ode: MechanicalODE, y: Phase, g: Float[Array, "m n"]) -> tuple[Array, 
 def _is_turned(product: Float[Array, "m m"], scale: Float[Array, " m"], rank: int | None) -> Bool[Array, ""]:
     rank = len(product) if rank is None else rank
     return minor_sign(jax.lax.stop_gradient(product * scale[:, None] * scale), rank) < 0
-
-
-# The smallest and the largest of the tolerances of all unknowns.
-Span: TypeAlias = tuple[Time, Time]
 
 
 def bearable_drift(tolerance: Float[ArrayLike, "..."], size: Num[ArrayLike, "..."]) -> Float[Array, "..."]:

@@ -185,15 +185,15 @@ class ResidualForm(eqx.Module):
         n, m, p = ode.layout.size, ode.holonomic, ode.nonholonomic
         q, v = y[:n], y[n : 2 * n]
         multipliers, eta = jnp.split(y[2 * n :] if self.units is None else y[2 * n :] * self.units, [m + p])
-        mass = dense_mass(ode.mass(q))
-        momentum = weighted(mass, yd[n : 2 * n]) - ode.force(t, q, v) + ode.reaction(t, q, v, multipliers)
+        pull, mass = ode.reaction(t, q, v), dense_mass(ode.mass(q))
+        momentum = weighted(mass, yd[n : 2 * n]) - ode.force(t, q, v) + pull(multipliers)
         velocity = ode.velocity_constraint(t, q, v)
         kinematics = yd[:n] - v
         if self.form == "index-3":
             return jnp.concatenate([kinematics, momentum, ode.constraint(t, q), velocity[m:]])
         if self.form == "index-2":
             return jnp.concatenate([kinematics, momentum, velocity])
-        stabilised = weighted(mass, kinematics) + ode.reaction(t, q, v, eta)
+        stabilised = weighted(mass, kinematics) + pull(eta)
         return jnp.concatenate([stabilised, momentum, velocity, ode.constraint(t, q)])
 
 

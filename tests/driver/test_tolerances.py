@@ -160,6 +160,28 @@ def test_multipliers_have_those_of_the_velocities_along_their_constraint():
     np.testing.assert_allclose(found, [1, 2, 3, 5, along, along], rtol=1e-14)
 
 
+def test_numbers_by_name_are_for_each_unknown():
+    decay = dae_jax.ImplicitDAE(lambda t, y, yd, args: {"x": yd["x"] + y["x"], "z": y["z"] - y["x"]})
+    start = {"x": jnp.ones(()), "z": jnp.ones(())}
+    controller = PIDController(1e-6, {"x": 1e-6, "z": 1e-3})
+    sol = dae_jax.daesolve(decay, DOP853(), 0.0, 1.0, None, start, stepsize_controller=controller)
+    assert sol.precision == "float64, rtol 1e-06, atol for each unknown"
+
+
+def test_below_round_off_in_float32():
+    decay = dae_jax.ImplicitDAE(lambda t, y, yd, args: yd + y)
+    with pytest.raises(RuntimeError, match=r"rtol = 1e-12 and atol = 1e-12, are below round-off, which is 1\.2e-07"):
+        dae_jax.daesolve(
+            decay,
+            diffrax.Tsit5(),
+            0.0,
+            1.0,
+            None,
+            jnp.ones(2, jnp.float32),
+            stepsize_controller=PIDController(1e-12, 1e-12),
+        )
+
+
 def test_below_round_off_of_one_unknown():
     decay = dae_jax.ImplicitDAE(lambda t, y, yd, args: yd + y)
     controller = PIDController(0.0, jnp.array([1e-6, 1e-22]))

@@ -34,10 +34,19 @@ def test_is_what_the_jacobian_says(count, constraint, nonholonomic):
     ode = MechanicalODE.of(system, 0.3, (jnp.asarray(q), jnp.asarray(v)), None)
     multipliers = jnp.asarray(rest[: ode.holonomic + ode.nonholonomic])
     a = ode.constraint_jacobian(0.3, jnp.asarray(q), jnp.asarray(v))
-    np.testing.assert_allclose(ode.reaction(0.3, q, v, multipliers), a.T @ multipliers, rtol=1e-13, atol=1e-15)
+    np.testing.assert_allclose(ode.reaction(0.3, q, v)(multipliers), a.T @ multipliers, rtol=1e-13, atol=1e-15)
     of_position = multipliers[: ode.holonomic]
     expected = a[: ode.holonomic].T @ of_position
-    np.testing.assert_allclose(ode.reaction(0.3, q, v, of_position), expected, rtol=1e-13, atol=1e-15)
+    np.testing.assert_allclose(ode.reaction(0.3, q, v)(of_position), expected, rtol=1e-13, atol=1e-15)
+
+
+@pytest.mark.parametrize("count", [2, REVERSE_FROM], ids=["few", "many"])
+def test_without_holonomic_constraints_theirs_is_zero(count):
+    system = dae_jax.ConstrainedSystem(lambda t, q, v, args: -q, nonholonomic=lambda t, q, v, args: v[1:] * q[:-1])
+    at = jnp.arange(1.0, count + 2), jnp.zeros(count + 1)
+    pull = MechanicalODE.of(system, 0.0, at, None).reaction(0.0, *at)
+    np.testing.assert_array_equal(pull(jnp.ones(count)), [0, *range(1, count + 1)])
+    np.testing.assert_array_equal(pull(jnp.zeros(0)), np.zeros(count + 1))
 
 
 def test_a_branch_that_is_not_taken_is_not_differentiated_in_reverse():
@@ -46,7 +55,7 @@ def test_a_branch_that_is_not_taken_is_not_differentiated_in_reverse():
     system = dae_jax.ConstrainedSystem(lambda t, q, v, args: -q, guarded)
     at = jnp.array([0.0, 0.0]), jnp.array([1.0, -1.0])
     ode = MechanicalODE.of(system, 0.0, at, None)
-    np.testing.assert_array_equal(ode.reaction(0.0, *at, jnp.ones(1)), [1.0, 1.0])
+    np.testing.assert_array_equal(ode.reaction(0.0, *at)(jnp.ones(1)), [1.0, 1.0])
 
 
 @pytest.mark.parametrize("form", ["index-3", "GGL"])
