@@ -58,7 +58,7 @@ class Case:
     - `name`; `system`, `y0`, `args`; `t1` in s.
     - `truth(times)`: (q, v) at these times, not from this library; `or_else`: more of them, where the equations have several solutions.
     - `size`: of positions and of velocities, numbers or arrays like q: errors and drift are relative to it.
-    - `rtol`; the absolute tolerance is `rtol` times the smallest size, at most 1.
+    - `rtol`; the absolute tolerance is `rtol` times the smallest size, at most 1; with `tolerance_each`, of each unknown, times its size.
     - `steps`, `rate`: of methods with fixed steps, how many, and the angular frequency that they must resolve, in 1/s.
     - `chart`: for the state-space form.
     - `due`: what must happen: an "answer", a "refusal", a "failure" (at the time `ends`), "words" (either of them, at any time)
@@ -77,6 +77,7 @@ class Case:
     args: Any = None
     size: tuple[Any, Any] = (1.0, 1.0)
     rtol: float = 1e-8
+    tolerance_each: bool = False
     steps: int = 1000
     rate: float = 1.0
     chart: Callable[..., Any] | None = None

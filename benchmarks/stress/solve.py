@@ -38,10 +38,16 @@ def solved(case: Case, name: str) -> Outcome:
     begin = time.perf_counter()
     formulation = dj.StateSpace(case.chart) if method.formulation == "chart" else case.formulation or method.formulation
     fixed = case.fixed or method.order is not None
-    # The coordinates of a chart are angles, of size 1.
-    smallest = min(1.0, *(float(np.min(x)) for x in case.size))
-    tolerances = {"rtol": np.asarray(case.rtol), "atol": np.asarray(case.rtol * smallest)}
-    tolerances = {name: value.astype(case.y0[0].dtype) for name, value in tolerances.items()}
+    kind, shape = case.y0[0].dtype, case.y0[0].shape
+    if case.tolerance_each and not isinstance(formulation, dj.StateSpace):
+        sizes = tuple(np.broadcast_to(size, shape) for size in case.size)
+    else:
+        # The coordinates of a chart are angles, of size 1.
+        sizes = min(1.0, *(float(np.min(x)) for x in case.size))
+    tolerances = {
+        "rtol": np.asarray(case.rtol, kind),
+        "atol": jax.tree.map(lambda size: np.asarray(case.rtol * size, kind), sizes),
+    }
     times = np.linspace(0.0, case.t1, case.times)
     said: list[warnings.WarningMessage] = []
     try:

@@ -96,9 +96,18 @@ def in_integrated(controller: Controller, t: Time, y: Y, ode: Equations, formula
                 f"`{name}` of the step-size control has a tolerance for each unknown, but {type(formulation).__name__} integrates "
                 "coordinates of its own: give a number."
             )
-        return found(t, y, tolerance)
+        return found(t, y, tolerance, name == "atol")
 
     return changed(controller, change)
+
+
+def with_time_scale(ode: Any, controller: Controller, t: Time, y: Y) -> Any:
+    """The equations of a solver of residuals with the time scale of tolerances for each unknown."""
+    inner = getattr(controller, "controller", None)
+    if inner is not None:
+        return with_time_scale(ode, inner, t, y)
+    atol = getattr(controller, "atol", 0.0)
+    return ode if _is_number(atol) else ode.with_time_scale(t, y, atol)
 
 
 def in_one_vector(controller: Any, y: Y) -> Any:

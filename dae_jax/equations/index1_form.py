@@ -73,10 +73,12 @@ class Index1Form(eqx.Module):
         settled = jnp.concatenate([jnp.where(found, on, y), z[y.size :]])
         return form.decode(t, take(settled, self.ode.orders.places[0][: form.layout.size]))
 
-    def tolerances(self, t: Time, state: State, each: State) -> Float[Array, " z"]:
+    def tolerances(self, t: Time, state: State, each: State, absolute: bool) -> Float[Array, " z"]:
         """A tolerance for each unknown, of one for `each` number of the state."""
-        own = self.ode.form.tolerances(t, state, each)
-        return jnp.concatenate([take(own, self.ode.orders.owners), own])
+        return jnp.concatenate(self.ode.derivatives_tolerances(t, state, each, absolute))
+
+    def time_scale(self, t: Time, state: State, each: State) -> None:
+        """No unknown is of an index above 1."""
 
     def known_rates(self, z: Float[Array, " z"]) -> Float[Array, " z"]:
         """What z itself says of ż: the rate of all of Y."""

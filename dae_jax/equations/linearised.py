@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Inexact, Int, PyTree
 from scipy.sparse import csr_array
 
-from ..linalg import fixed_point, relative_change
+from ..linalg import fixed_point, powers, relative_change
 from ..linalg.dense import LOOPED
 from ..linalg.iterative import GMRES, Iterative
 from ..linalg.sparse import Sparse
@@ -69,7 +69,8 @@ class LinearisedResidual(eqx.Module):
     """J + c M with J = ∂F/∂y and M = ∂F/∂ẏ, of a residual. It travels through `diffrax.diffeqsolve` as `args`.
 
     `start`: ẏ where a solve starts. `felt`: the smallest steps that are to be short enough for forward derivatives too, where the
-    program is traced for these. `patient`: whether steps that fail are not tried again with a smaller size.
+    program is traced for these. `patient`: whether steps that fail are not tried again with a smaller size. `time_scale`: for
+    each unknown the time in which the tolerance of a rate makes that of what it is the rate of; the unit of time if not known.
     """
 
     form: ResidualForm | Index1Form
@@ -77,6 +78,7 @@ class LinearisedResidual(eqx.Module):
     start: Float[Array, " n"] | None = None
     felt: Scalar | None = None
     patient: BoolLike = False
+    time_scale: Float[Array, " n"] | None = None
 
     @classmethod
     def of(
@@ -108,9 +110,14 @@ class LinearisedResidual(eqx.Module):
         """The state in the user's structure."""
         return self.form.decode(t, y)
 
-    def tolerances(self, t: Time, y: Float[Array, " n"], each: State) -> Float[Array, " n"]:
+    def tolerances(self, t: Time, y: Float[Array, " n"], each: State, absolute: bool) -> Float[Array, " n"]:
         """A tolerance for each unknown, of one for `each` number of the state."""
-        return self.form.tolerances(t, self.decode(t, y), each)
+        return self.form.tolerances(t, self.decode(t, y), each, absolute)
+
+    def with_time_scale(self, t: Time, y: Float[Array, " n"], each: State) -> "LinearisedResidual":
+        """With the `time_scale` of a tolerance for `each` number of the state."""
+        found = self.form.time_scale(t, self.decode(t, y), each)
+        return dataclasses.replace(self, time_scale=jax.lax.stop_gradient(found))
 
     def residual(self, t: Time, y: Float[Array, " n"], yd: Float[Array, " n"]) -> Float[Array, " n"]:
         """F(t, y, ẏ)."""
@@ -202,12 +209,12 @@ class LinearisedResidual(eqx.Module):
         return dataclasses.replace(self, start=constant(fixed.rates(t, y)))
 
     def weights(self, h: Time, raised: Time = 1.0) -> Float[Array, " n"]:
-        """h^(k−1) for a variable of index k > 1: how much of its error counts; up to `raised` times that, or h^(k−2), for those
-        that the user sees.
+        """(h/T)^(k−1) for a variable of index k > 1, where h is below its `time_scale` T: how much of its error counts; up to
+        `raised` times that, or (h/T)^(k−2), for those that the user sees.
 
         Source: E. Hairer, G. Wanner, *Solving Ordinary Differential Equations II*, VII.3 and the program RADAU5.
         """
-        size = jnp.minimum(jnp.abs(h), 1)
+        size = jnp.minimum(jnp.abs(h) if self.time_scale is None else jnp.abs(h) / self.time_scale, 1)
         indices = np.array(self.structure.indices)
         weights = powers(size, tuple(np.maximum(indices - 1, 0).tolist()))
         seen = self.followed
@@ -231,18 +238,6 @@ class LinearisedResidual(eqx.Module):
 
 def _combined(combination: Combination, rows: Array, c: Inexact[Array, ""]) -> Any:
     return combination.of([rows * c**k if k else rows for k in range(combination.degree + 1)])[0]
-
-
-def powers(x: Float[Array, ""], exponents: tuple[int, ...]) -> Float[Array, " n"]:
-    """x to each of the exponents."""
-    values = [jnp.ones_like(x)]
-    for _ in range(max(exponents, default=0)):
-        values.append(values[-1] * x)
-    return (
-        jnp.stack([values[k] for k in exponents])
-        if len(exponents) <= LOOPED
-        else jnp.stack(values)[np.array(exponents)]
-    )
 
 
 class _PatternKey(NamedTuple):

@@ -93,7 +93,7 @@ class MechanicalODE(ManifoldODE):
         q, v = state
         return self.layout.flatten(q), self.layout.flatten(v)
 
-    def tolerances(self, t: Time, y: Phase, each: State) -> Any:
+    def tolerances(self, t: Time, y: Phase, each: State, absolute: bool) -> Any:
         """A tolerance for each number of y, of one for `each` of the state."""
         return self.encode(each)
 

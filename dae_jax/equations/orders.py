@@ -49,6 +49,12 @@ class Orders:
         return np.concatenate([np.flatnonzero(d > k) for k in range(d.max())])
 
     @property
+    def levels(self) -> Int[np.ndarray, " N"]:
+        """Of which order each entry of Y is."""
+        d = np.array(self.variables)
+        return np.concatenate([np.full(np.sum(d > k), k) for k in range(d.max())])
+
+    @property
     def first_derivatives(self) -> Int[np.ndarray, " N"]:
         """Which variable each entry of Y is the first derivative of, −1 for others."""
         found = np.full(self.size, -1)

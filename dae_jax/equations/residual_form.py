@@ -136,19 +136,35 @@ class ResidualForm(eqx.Module):
         """The state in the user's structure."""
         return self.layout.unflatten(y[: self.layout.size])
 
-    def tolerances(self, t: Time, state: State, each: State) -> Float[Array, " n"]:
+    def tolerances(self, t: Time, state: State, each: State, absolute: bool) -> Float[Array, " n"]:
         """A tolerance for each unknown, of one for `each` number of the state, τ: a multiplier has that of the velocities along its
-        constraint, (Σ aᵢ² τᵢ² / Σ aᵢ²)^½.
+        constraint, (Σ aᵢ² τᵢ² / Σ aᵢ²)^½; λ, the size of an acceleration, an `absolute` one over the `time_scale`.
         """
         own = self.layout.flatten(each)
         if not is_mechanism(self.system):
             return own
+        of_q, of_v = self._along_constraints(t, state, each)
+        return jnp.concatenate([own, _over(of_v, _over(of_q, of_v)) if absolute else of_v, of_v])[: self.size]
+
+    def time_scale(self, t: Time, state: State, each: State) -> Float[Array, " n"] | None:
+        """For each unknown the time in which the absolute tolerance of velocities makes that of positions, for `each` number of the
+        state; None where nothing is known to be a rate.
+        """
+        if not is_mechanism(self.system):
+            return None
+        own = _over(*MechanicalODE.of(self.system, t, state, self.args).encode(each))
+        along = _over(*self._along_constraints(t, state, each))
+        return jnp.concatenate([own, own, along, along])[: self.size]
+
+    def _along_constraints(self, t: Time, state: State, each: State) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
+        """The tolerances of positions and of velocities along the constraints."""
+        assert is_mechanism(self.system)
         ode = MechanicalODE.of(self.system, t, state, self.args)
         squares = jax.lax.stop_gradient(ode.constraint_jacobian(t, *ode.encode(state))) ** 2
         sums = jnp.sum(squares, 1)
         weights = jnp.where(sums[:, None] > 0, squares / jnp.where(sums > 0, sums, 1)[:, None], 1 / squares.shape[1])
-        along = jnp.sqrt(jnp.sum(weights * ode.encode(each)[1] ** 2, 1))
-        return jnp.concatenate([own, along, along])[: self.size]
+        q, v = (jnp.sqrt(jnp.sum(weights * x**2, 1)) for x in ode.encode(each))
+        return q, v
 
     @property
     def may_be_nonlinear(self) -> bool:
@@ -195,6 +211,12 @@ class ResidualForm(eqx.Module):
             return jnp.concatenate([kinematics, momentum, velocity])
         stabilised = weighted(mass, kinematics) + pull(eta)
         return jnp.concatenate([stabilised, momentum, velocity, ode.constraint(t, q)])
+
+
+def _over(a: Float[Array, " n"], b: Float[Array, " n"]) -> Float[Array, " n"]:
+    """a / b; 1 where one of them is 0, a tolerance that is not asked for."""
+    asked = (a > 0) & (b > 0)
+    return jnp.where(asked, a / jnp.where(asked, b, 1), 1)
 
 
 def weighted(mass: Float[Array, "..."] | None, x: Float[Array, "n *k"]) -> Float[Array, "n *k"]:

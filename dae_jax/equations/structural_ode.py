@@ -16,6 +16,7 @@ from ..linalg import (
     amplified_roundoff,
     fixed_point,
     implicit_root,
+    powers,
     relative_change,
     row_products,
     semidefinite_solve,
@@ -284,9 +285,21 @@ class StructuralODE(ManifoldODE):
         both = jnp.concatenate([y, self.highest(t, y)]) if algebraic else y
         return self.form.decode(t, take(both, self.orders.places[0][:count]))
 
-    def tolerances(self, t: Time, y: Float[Array, " N"], each: State) -> Float[Array, " N"]:
-        """A tolerance for each number of y, of one for `each` of the state; derivatives have that of their variable."""
-        return take(self.form.tolerances(t, self.decode(t, y), each), self.orders.owners)
+    def tolerances(self, t: Time, y: Float[Array, " N"], each: State, absolute: bool) -> Float[Array, " N"]:
+        """A tolerance for each number of y, of one for `each` of the state."""
+        return self.derivatives_tolerances(t, self.decode(t, y), each, absolute)[0]
+
+    def derivatives_tolerances(
+        self, t: Time, state: State, each: State, absolute: bool
+    ) -> tuple[Float[Array, " N"], Float[Array, " n"]]:
+        """Those of Y and of the derivatives of order Dⱼ: that of the variable, an `absolute` one over its time scale for each order."""
+        form, orders = self.form, self.orders
+        own, scale = form.tolerances(t, state, each, absolute), form.time_scale(t, state, each) if absolute else None
+        lower, highest = take(own, orders.owners), own
+        if scale is not None:
+            lower = lower / powers(take(scale, orders.owners), tuple(orders.levels.tolist()))
+            highest = highest / powers(scale, orders.variables)
+        return lower, highest
 
     def encode(self, t: Time, state: State) -> Float[Array, " N"]:
         """Y of a state: the derivatives of order 1 and higher are those with which the equations hold, or nearly hold."""

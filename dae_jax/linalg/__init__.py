@@ -8,7 +8,7 @@ from .dense import (
     signed_log_determinant as signed_log_determinant,
     solve as solve,
 )
-from .elimination import Elimination as Elimination, elimination as elimination, take as take
+from .elimination import Elimination as Elimination, elimination as elimination, powers as powers, take as take
 from .lineax_solvers import SmallCholesky as SmallCholesky, SmallLU as SmallLU
 from .newton import (
     amplified_roundoff as amplified_roundoff,

@@ -19,6 +19,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from .definite_factors import definite_pivot
+from .dense import LOOPED
 from .semidefinite import semidefinite_solve
 
 
@@ -246,3 +247,13 @@ def take(x: Array, index: Int[np.ndarray, " k"]) -> Array:
         return lax.pad(piece, jnp.zeros((), x.dtype), [(first, k - 1 - last, 0)]) if len(inner) < k else piece
     taken = x[np.maximum(index, 0)]
     return taken if len(used) == k else jnp.where(index >= 0, taken, 0)
+
+
+def powers(x: Float[Array, "*#n"], exponents: tuple[int, ...]) -> Float[Array, " n"]:
+    """x, a number or one for each, to each of the exponents."""
+    values = [jnp.ones_like(x)]
+    for _ in range(max(exponents, default=0)):
+        values.append(values[-1] * x)
+    if len(exponents) > LOOPED:
+        return jnp.stack(values)[(np.array(exponents), np.arange(len(exponents)))[: 1 + x.ndim]]
+    return jnp.stack([values[k][i] if x.ndim else values[k] for i, k in enumerate(exponents)])

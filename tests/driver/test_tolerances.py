@@ -155,9 +155,12 @@ def test_resets_know_what_each_unknown_is_off_by():
 def test_multipliers_have_those_of_the_velocities_along_their_constraint():
     form = ResidualForm.of(PENDULUM, 0.0, START, None, "GGL")
     turned = jnp.array([0.6, 0.8]), jnp.zeros(2)
-    found = form.tolerances(0.0, turned, (jnp.array([1.0, 2.0]), jnp.array([3.0, 5.0])))
-    along = np.hypot(0.6 * 3, 0.8 * 5)
-    np.testing.assert_allclose(found, [1, 2, 3, 5, along, along], rtol=1e-14)
+    each = jnp.array([1.0, 2.0]), jnp.array([3.0, 5.0])
+    of_q, of_v = np.hypot(0.6 * 1, 0.8 * 2), np.hypot(0.6 * 3, 0.8 * 5)
+    np.testing.assert_allclose(form.tolerances(0.0, turned, each, False), [1, 2, 3, 5, of_v, of_v], rtol=1e-14)
+    np.testing.assert_allclose(form.tolerances(0.0, turned, each, True), [1, 2, 3, 5, of_v**2 / of_q, of_v], rtol=1e-14)
+    scale = [1 / 3, 2 / 5, 1 / 3, 2 / 5, of_q / of_v, of_q / of_v]
+    np.testing.assert_allclose(form.time_scale(0.0, turned, each), scale, rtol=1e-14)
 
 
 def test_numbers_by_name_are_for_each_unknown():
@@ -187,3 +190,26 @@ def test_below_round_off_of_one_unknown():
     controller = PIDController(0.0, jnp.array([1e-6, 1e-22]))
     with pytest.raises(RuntimeError, match=r"rtol = 0 and atol = 1e-22, are below round-off"):
         dae_jax.daesolve(decay, RadauIIA5(), 0.0, 1.0, None, jnp.ones(2), stepsize_controller=controller)
+
+
+@pytest.mark.parametrize("method", ["GGL", "BDF", "Radau", "reduced"])
+def test_the_unit_of_time_is_of_no_account(method):
+    """A pendulum that swings in nanoseconds, or in decades, takes the steps of one that swings in seconds."""
+    system = ConstrainedSystem(lambda t, q, v, unit: GRAVITY * unit**2, PENDULUM.constraint)
+    solver, formulation = METHODS[method]
+
+    @jax.jit
+    def solved(unit):
+        start = jnp.array([0.6, -0.8]), jnp.array([0.8, 0.6]) * unit
+        controller = PIDController(1e-8, (1e-8, 1e-8 * unit))
+        sol = dae_jax.daesolve(
+            system, solver, 0.0, 1 / unit, None, start, unit, formulation=formulation, stepsize_controller=controller
+        )
+        return sol.stats["num_steps"], sol.final[0], sol.final[1] / unit
+
+    steps, q, v = solved(1.0)
+    for unit in (2.0**-30, 2.0**30):
+        others, *state = solved(unit)
+        # Which order `Radau` takes is a matter of round-off.
+        assert abs(others - steps) <= (0.3 * steps if method == "Radau" else 0)
+        np.testing.assert_allclose(state, (q, v), atol=1e-8)

@@ -1,5 +1,6 @@
 """Masses, lengths, constraints, time spans and units over many decades: the answer may not depend on them beyond rounding.
-A double pendulum, which also starts folded, with its tip at its pivot, where its constraints are not singular.
+A double pendulum, which also starts folded, with its tip at its pivot, where its constraints are not singular. Each unknown has a
+tolerance of its own, a part of its size; or all have one number, that of the smallest.
 """
 
 import dataclasses
@@ -68,7 +69,7 @@ def two_rods(
     system = dj.ConstrainedSystem(force, constraint, mass)
     return Case(
         name, system, embed(0, z0), t1 * time, lambda times: scaled(np.asarray(times) / time), args, size, rate=fastest / time,
-        steps=2000, chart=chart,
+        steps=2000, chart=chart, tolerance_each=True,
     )  # fmt: skip
 
 
@@ -90,8 +91,13 @@ def cases(quick):
         return [two_rods(name, **what) for name, what in small.items()]
     found = [two_rods(name, **what) for name, what in {**small, **MORE}.items()]
     tiny = next(case for case in found if case.name == "lengths 1e-6")
+    mixed = [
+        dataclasses.replace(case, name=f"{case.name}, one tolerance", tolerance_each=False)
+        for case in found
+        if case.name in MIXED
+    ]
     off = {"y0": (tiny.y0[0] * 1.01, tiny.y0[1]), "off": 1e-2, "due": "refusal"}
-    return [*found, dataclasses.replace(tiny, name="lengths 1e-6, off by 1 %", **off)]
+    return [*found, *mixed, dataclasses.replace(tiny, name="lengths 1e-6, off by 1 %", **off)]
 
 
 MORE = {
@@ -108,3 +114,5 @@ MORE = {
     "time span 1e9 s": {"gravity": 4e-18},
     "units mixed by 1e12": {"units": (1e-6, 1e6, 1e-6, 1e6)},
 }
+# Also with one number for all tolerances, that of the smallest unknown.
+MIXED = ("time span 1e9 s", "units mixed by 1e12")
