@@ -7,7 +7,7 @@ from pathlib import Path
 
 from dae_jax.app.options import writable
 
-from . import chain, cost, gpu, jit, large, stiff, sweep, timing, work_precision
+from . import chain, cost, first, gpu, jit, large, stiff, sweep, timing, work_precision
 from .peers import NAMES, PACKAGES, load
 
 
@@ -15,6 +15,7 @@ PARTS = {
     "work-precision": work_precision,
     "chain": chain,
     "cost": cost,
+    "first": first,
     "sweep": sweep,
     "stiff": stiff,
     "jit": jit,

@@ -9,7 +9,7 @@ from tests.conftest import SLOW
 
 
 # Seconds, on a machine whose cores are all at work.
-LIMIT = 3.0
+LIMIT = 2.0
 # What is run at each commit however long it takes: what each method promises, what people read first.
 ALWAYS = (
     "tests/solvers/test_methods.py",

@@ -52,7 +52,7 @@ class Orders:
     def levels(self) -> Int[np.ndarray, " N"]:
         """Of which order each entry of Y is."""
         d = np.array(self.variables)
-        return np.concatenate([np.full(np.sum(d > k), k) for k in range(d.max())])
+        return np.concatenate([np.full(int(np.sum(d > k)), k) for k in range(d.max())])
 
     @property
     def first_derivatives(self) -> Int[np.ndarray, " N"]:
