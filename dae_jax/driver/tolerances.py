@@ -14,7 +14,7 @@ from jax.flatten_util import ravel_pytree
 from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
-from ..equations.manifold_ode import Equations
+from ..equations.manifold_ode import Equations, ManifoldODE
 from ..types import Args, Controller, Scalar, State, Time, Y
 from ..validate.states import NUMBERS, brief, describe
 from .observed_steps import AbstractStepsOf
@@ -99,6 +99,15 @@ def in_integrated(controller: Controller, t: Time, y: Y, ode: Equations, formula
         return found(t, y, tolerance)
 
     return changed(controller, change)
+
+
+def measured(ode: Equations, controller: Controller) -> Any:
+    """The equations with distances in tolerances, where each unknown has one of its own."""
+    inner = getattr(controller, "controller", None)
+    if inner is not None:
+        return measured(ode, inner)
+    atol = getattr(controller, "atol", 0.0)
+    return ode if _is_number(atol) or not isinstance(ode, ManifoldODE) else ode.measured_in(atol)
 
 
 def in_one_vector(controller: Any, y: Y) -> Any:
