@@ -4,6 +4,7 @@ import dataclasses
 import sys
 import time
 import warnings
+from collections import Counter
 from collections.abc import Iterator
 from typing import Any, cast
 
@@ -185,12 +186,15 @@ def _timed(scene: Scene, method: Method, times: np.ndarray, rtol: float, step: f
 def chosen(scene: Scene, names: list[str] | None) -> dict[str, Method]:
     """The methods of these names, by default all that apply.
 
-    Errors: `ValueError` for a name that is none of them.
+    Errors: `ValueError` for a name that is none of them, and for one that is there twice.
     """
     known = methods(scene)
     unknown = [name for name in names or () if name not in known]
     if unknown:
         raise ValueError(f"unknown method {', '.join(map(repr, unknown))}; {scene.name} knows {', '.join(known)}")
+    twice = [name for name, count in Counter(names).items() if count > 1]
+    if twice:
+        raise ValueError(f"method {', '.join(map(repr, twice))} is named more than once")
     return {name: known[name] for name in (known if names is None else names)}
 
 

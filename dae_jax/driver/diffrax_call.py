@@ -39,7 +39,7 @@ from .problem import Problem
 from .start import is_saved_part
 from .summed_errors import SummedErrors
 from .switches import stepped_over
-from .tolerances import in_integrated, in_one_vector, with_time_scale
+from .tolerances import in_integrated, in_one_vector, measured
 from .traced_once import TracedOnce
 from .trajectory_adjoint import as_it_is, can_be_taped
 
@@ -92,13 +92,13 @@ def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[
     decode = Decode(solve.formulation, solve.solver)
     solver = economical(solve.solver, solve.between())
     controller = in_integrated(_fitted(solve.controller), t0, y, ode, solve.formulation)
+    ode = measured(ode, controller, t0, y)
     felt = SMALL * jax.lax.stop_gradient(jnp.abs(t1 - t0)) if isinstance(solve.adjoint, OneDirection) else None
     if takes_residuals(solver):
         solver = _with_tolerances_of(controller, solver)
         # Known steps have succeeded once; rounded in another way Newton's method may take longer for one, or seem to diverge.
         # As an array: the step is not traced anew for it.
         ode = dataclasses.replace(ode, felt=felt, patient=jnp.asarray(steps is not None))
-        ode = with_time_scale(ode, solve.controller, t0, y)
         chosen = dt0 is None and not isinstance(controller, diffrax.StepTo)
         dt0 = first_step(ode.start, solver, t0, t1, y) if chosen else dt0
     else:

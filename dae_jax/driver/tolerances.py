@@ -101,13 +101,13 @@ def in_integrated(controller: Controller, t: Time, y: Y, ode: Equations, formula
     return changed(controller, change)
 
 
-def with_time_scale(ode: Any, controller: Controller, t: Time, y: Y) -> Any:
-    """The equations of a solver of residuals with the time scale of tolerances for each unknown."""
+def measured(ode: Any, controller: Controller, t: Time, y: Y) -> Any:
+    """The equations with distances and times in tolerances, where each unknown has one of its own."""
     inner = getattr(controller, "controller", None)
     if inner is not None:
-        return with_time_scale(ode, inner, t, y)
+        return measured(ode, inner, t, y)
     atol = getattr(controller, "atol", 0.0)
-    return ode if _is_number(atol) else ode.with_time_scale(t, y, atol)
+    return ode if _is_number(atol) else ode.measured_in(t, y, atol)
 
 
 def in_one_vector(controller: Any, y: Y) -> Any:

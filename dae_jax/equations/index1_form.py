@@ -77,9 +77,6 @@ class Index1Form(eqx.Module):
         """A tolerance for each unknown, of one for `each` number of the state."""
         return jnp.concatenate(self.ode.derivatives_tolerances(t, state, each, absolute))
 
-    def time_scale(self, t: Time, state: State, each: State) -> None:
-        """No unknown is of an index above 1."""
-
     def known_rates(self, z: Float[Array, " z"]) -> Float[Array, " z"]:
         """What z itself says of ż: the rate of all of Y."""
         return jnp.concatenate([take(z, self.ode.orders.derivatives), jnp.zeros(self.ode.form.size, z.dtype)])

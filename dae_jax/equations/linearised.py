@@ -114,9 +114,11 @@ class LinearisedResidual(eqx.Module):
         """A tolerance for each unknown, of one for `each` number of the state."""
         return self.form.tolerances(t, self.decode(t, y), each, absolute)
 
-    def with_time_scale(self, t: Time, y: Float[Array, " n"], each: State) -> "LinearisedResidual":
-        """With the `time_scale` of a tolerance for `each` number of the state."""
-        found = self.form.time_scale(t, self.decode(t, y), each)
+    def measured_in(self, t: Time, y: Float[Array, " n"], lengths: Float[Array, " n"]) -> "LinearisedResidual":
+        """The same with the `time_scale` of these tolerances, where variables of an index above 1 count by the step size."""
+        if isinstance(self.form, Index1Form) or max(self.structure.indices) < 2:
+            return self
+        found = self.form.time_scale(t, self.decode(t, y), self.decode(t, lengths))
         return dataclasses.replace(self, time_scale=jax.lax.stop_gradient(found))
 
     def residual(self, t: Time, y: Float[Array, " n"], yd: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -103,6 +103,12 @@ class ManifoldODE(eqx.Module):
         """The nearest point on the manifold at time t, with the normals at y itself, and whether it was found."""
         return self.retract_along(t, y, self.normals(t, y))
 
+    def measured_in(self, t: Time, y: Y, lengths: Y) -> "ManifoldODE":
+        """The same where points are near to each other by these lengths along each number of y, the tolerances of unknowns that have
+        units of their own; but for what has a metric, as that of masses.
+        """
+        return self
+
     @abc.abstractmethod
     def tangent(self, dy: Y, normals: Normals) -> Any:
         """The part of a derivative ẏ in the tangent space to which `normals` are normal."""

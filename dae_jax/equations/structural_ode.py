@@ -73,6 +73,8 @@ class StructuralODE(ManifoldODE):
     sparse: SparseInvariants | None = eqx.field(static=True, default=None)
     # The blocks of the matrix of the equations for X, rows and columns, that depend on anything.
     varying: tuple[Block, ...] = eqx.field(static=True, default=())
+    # The square of what counts as one along each entry of Y; all count alike where it is not known.
+    metric: Float[Array, " N"] | None = None
 
     @classmethod
     def of(cls, form: ResidualForm, dtype: DType, complete: bool = False) -> "StructuralODE":
@@ -207,7 +209,7 @@ class StructuralODE(ManifoldODE):
 
     @at_one_instant
     def normals(self, t: Time, y: Float[Array, " N"]) -> Float[Array, "m N"]:
-        """∂H/∂Y, whose rows are normal to the manifold in the metric in which all entries of Y count alike."""
+        """∂H/∂Y, whose rows, times the `metric`, are normal to the manifold in it."""
         return jax.jacfwd(self.violations, 1)(t, y)
 
     def lasting_normals(
@@ -220,7 +222,8 @@ class StructuralODE(ManifoldODE):
         if not len(here):
             return here
         there = lax.stop_gradient(self.normals(t1, ahead))
-        along = jnp.abs(jnp.sum((there - here) * here, 1)) / jnp.sum(here * here, 1)
+        moves = self._moves(here)
+        along = jnp.abs(jnp.sum((there - here) * moves, 1)) / jnp.sum(here * moves, 1)
         return jnp.where(jnp.any(along > TURNS), lasting(here, there), here)
 
     def sizes(self, t: Time, y: Float[Array, " N"], of: tuple[Float[Array, " N"], ...]) -> list[Float[Array, " m"]]:
@@ -234,11 +237,15 @@ class StructuralODE(ManifoldODE):
     def tangent(self, dy: Float[Array, " N"], normals: Float[Array, "m N"]) -> Any:
         if not len(normals):
             return dy
-        gram = row_products(normals, normals)
+        gram = row_products(normals, self._moves(normals))
         return dy - self.displace(0, normals, semidefinite_solve(gram, jnp.sum(normals * dy, 1)))
 
     def displace(self, y: Float[Array, " N"] | float, normals: Float[Array, "m N"], mu: Float[Array, " m"]) -> Any:
-        return y + jnp.sum(normals * mu[:, None], 0)
+        return y + jnp.sum(self._moves(normals) * mu[:, None], 0)
+
+    def _moves(self, normals: Float[Array, "m N"]) -> Float[Array, "m N"]:
+        """What leads along the normals."""
+        return normals if self.metric is None else normals * self.metric
 
     def retract_along(
         self, t: Time, y: Float[Array, " N"], normals: Float[Array, "m N"], bend: float | None = None
@@ -256,7 +263,7 @@ class StructuralODE(ManifoldODE):
             def correct(mu: Float[Array, " m"]) -> tuple[Any, Any]:
                 here = ode.displace(y, normals, mu)
                 off, across = ode.violations(t, here), ode.normals(t, here)
-                delta = solve(row_products(across, normals), off)
+                delta = solve(row_products(across, ode._moves(normals)), off)
                 size = relative_change(ode.displace(0, normals, delta), here)
                 settled = jnp.all(jnp.abs(off) <= noise * row_products(jnp.abs(across), jnp.abs(here)[None])[:, 0])
                 return mu - delta, jnp.where(settled & (size < amplified), 0, size)
@@ -300,6 +307,11 @@ class StructuralODE(ManifoldODE):
             lower = lower / powers(take(scale, orders.owners), tuple(orders.levels.tolist()))
             highest = highest / powers(scale, orders.variables)
         return lower, highest
+
+    def measured_in(self, t: Time, y: Float[Array, " N"], lengths: Float[Array, " N"]) -> "StructuralODE":
+        parts, eps = lengths / jnp.max(lengths), float(jnp.finfo(lengths.dtype).eps)
+        # Beside what need not be right at all, others stay; their squares are numbers all the same.
+        return dataclasses.replace(self, metric=jnp.where(parts > eps, parts, eps) ** 2)
 
     def encode(self, t: Time, state: State) -> Float[Array, " N"]:
         """Y of a state: the derivatives of order 1 and higher are those with which the equations hold, or nearly hold."""

@@ -164,10 +164,9 @@ def value(
     difference = b.point(on_b[0]) - a.point(on_a[0])
     if kind == "displacement":
         return jnp.sum(difference * rotate(a.rotation, on_a[1][:, axis_of(d)]))
-    square = jnp.sum(difference**2)
-    # The direction of two points that coincide is none: their force is 0, and not NaN.
-    apart = square > 0
-    return jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1)), 0)
+    # Of two points that coincide too c ∂c/∂q has its derivatives, of a spring whose rest is 0 there the stiffness: the added length
+    # is below round-off, and three derivatives of the root stay below what is too large for a number.
+    return jnp.sqrt(jnp.sum(difference**2) + jnp.finfo(difference.dtype).tiny ** 0.4)
 
 
 def is_within_half_a_turn(

@@ -51,8 +51,8 @@ def read_mjcf(source: str | os.PathLike[str]) -> Mechanism:
 
     - `source`: the path of a file, or the text of one.
 
-    Errors: `ImportError` without MuJoCo; `ValueError` that lists all that is not supported. Limits, contacts and actuators are left
-    out, with one warning that names them.
+    Errors: `ImportError` without MuJoCo; `ValueError` that lists all that is not supported. Limits, contacts, actuators and
+    keyframes are left out, with one warning that names them.
     """
     try:
         mujoco: Model = importlib.import_module("mujoco")
@@ -287,11 +287,14 @@ class _Reader:
         in_contact = [self._name("geom", int(k)) for k in np.flatnonzero(touching)]
         driven = [self._name("actuator", k) for k in range(model.nu)]
         idle = [self._name("equality", int(k)) for k in np.flatnonzero(~model.eq_active0.astype(bool))]
+        # Where a solve is to start is said by `assemble`, not by a mechanism.
+        poses = [self._name("key", k) for k in range(model.nkey)]
         for what, names in (
             ("limits of", limited * (not self._disabled("LIMIT", "CONSTRAINT"))),
             ("contacts of", in_contact * (not self._disabled("CONTACT", "CONSTRAINT"))),
             ("actuators", driven * (not self._disabled("ACTUATION"))),
             ("inactive equalities", idle),
+            ("keyframes", poses),
         ):
             if names:
                 yield f"{what} {', '.join(map(repr, names))}"

@@ -193,6 +193,7 @@ WRONG = {
     "compare pendulum --methods magic": "unknown method 'magic'; pendulum knows differentiation",
     "compare pendulum --methods rattle,": "unknown method ''; pendulum knows differentiation",
     "compare pendulum --methods=": "unknown method ''; pendulum knows differentiation",
+    "compare pendulum --methods rattle,bdf-ggl,rattle": "method 'rattle' is named more than once",
     "compare robertson --methods rattle": "unknown method 'rattle'; robertson knows radau, radau-variable, bdf",
     "compare pendulum --t1 -1": "--t1 must be positive and finite, but is -1.0",
     "compare pendulum --t1 inf": "--t1 must be positive",

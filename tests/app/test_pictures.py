@@ -225,6 +225,22 @@ def test_work_precision_is_drawn_where_there_is_a_reference():
     assert not dict(figures.figures(scene, [], [], {}, 1e-8, paper=False))
 
 
+def test_errors_above_one_are_in_the_picture():
+    """They were beyond its edge, and a method that had no other in the legend alone."""
+    seconds = [1e-3, 1e-2, 1e-1]
+    figure = plotting.work_precision(
+        {"rattle": (seconds, [3e4, 30.0, np.inf]), "radau-ggl": (seconds, [5.0, 1e-2, 1e-5])}
+    )
+    axes = figure.axes[0]
+    low, high = axes.get_ylim()
+    lines = {label: line for line in axes.lines if not (label := line.get_label()).startswith("_")}
+    for name, errors in (("rattle", [1, 1, 1]), ("radau-ggl", [1, 1e-2, 1e-5])):
+        np.testing.assert_allclose(lines[name].get_ydata(), errors)
+    arrows = [line for line in axes.lines if line.get_label().startswith("_")]
+    assert [line.get_xdata().tolist() for line in arrows] == [seconds, seconds[:1]]
+    assert all(low < y < high for line in axes.lines for y in line.get_ydata())
+
+
 @pytest.mark.parametrize("highest", [2e-3, 8e-3, 7e-2, 1.0, 1e3])
 def test_numbers_along_an_axis_are_not_on_top_of_each_other(highest):
     """Run times from 1 to 70 ms had 2, 3, 4 and 6 times a power of ten, each over the next."""

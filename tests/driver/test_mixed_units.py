@@ -183,3 +183,44 @@ def test_states_and_charts_are_chosen_in_any_unit(solver, formulation, tolerance
     off, reached = off_of_a_pendulum_on_a_moving_support(solver, formulation, tolerance)
     assert reached
     assert off < 1000 * tolerance
+
+
+@pytest.mark.parametrize("method", [OrthogonalProjection, dae_jax.TangentSpace])
+def test_with_a_tolerance_for_each_unknown_units_do_not_count(method):
+    """The nearest point, and the tangent space's complement, are those of distances in tolerances: with metres beside kilometres and
+    millimetres projected as alike, a pendulum was 20 times as far off as in metres.
+    """
+
+    def end(unit):
+        def swinging(t, y, yd, args):
+            (x, v, force), (dx, dv, _) = (jnp.split(z * unit, [2, 4]) for z in (y, yd))
+            return jnp.concatenate([dx - v, dv + force * x + jnp.array([0.0, 9.81]), jnp.stack([x @ x - 1])])
+
+        start = np.array([np.sin(1.0), -np.cos(1.0), 0.0, 0.0, 9.81 * np.cos(1.0)]) / unit
+        steps = diffrax.PIDController(rtol=1e-6, atol=1e-6 / unit)
+        solver = method(diffrax.Bosh3())
+        sol = dae_jax.daesolve(ImplicitDAE(swinging), solver, 0.0, 1.5, None, start, stepsize_controller=steps)
+        return sol.final * unit, int(sol.stats["num_steps"])
+
+    # Powers of two round as 1 does.
+    (alike, steps), (apart, others) = end(np.ones(5)), end(2.0 ** np.array([15, -15, 15, -15, 0]))
+    assert steps == others
+    np.testing.assert_allclose(apart, alike, rtol=1e-9, atol=1e-9)
+
+
+def test_beside_a_tolerance_that_is_none_other_constraints_hold():
+    """Two pendulums, of which one need not be right: the squares of its tolerances are infinite."""
+
+    def swinging(t, y, yd, args):
+        x, v, force, rates = y["x"], y["v"], y["force"], yd["v"] + y["force"][:, None] * y["x"] + jnp.array([0.0, 9.81])
+        return {"x": yd["x"] - v, "v": rates, "force": jnp.sum(x**2, 1) - 1 + 0 * force}
+
+    start = {"x": jnp.array([[1.0, 0.0]] * 2), "v": jnp.zeros((2, 2)), "force": jnp.zeros(2)}
+    solve = lambda tolerance: dae_jax.daesolve(
+        ImplicitDAE(swinging), OrthogonalProjection(diffrax.Tsit5()), 0.0, 1.0, None, start,
+        stepsize_controller=diffrax.PIDController(
+            rtol=1e-6, atol=jax.tree.map(lambda y: jnp.stack([1e-6 + 0 * y[0], tolerance + 0 * y[0]]), start)
+        ),
+    )  # fmt: skip
+    for loose, tight in zip(*(jax.tree.leaves(solve(tolerance).final) for tolerance in (1e200, 1e-6)), strict=True):
+        np.testing.assert_allclose(loose[0], tight[0], rtol=1e-5, atol=1e-5)

@@ -65,6 +65,13 @@ def test_a_loop_is_closed_and_what_is_left_out_is_named():
     assert np.allclose([rates["a"], rates["b"], rates["c"]], [1.0, -1.0, 1.0])
 
 
+def test_keyframes_are_named():
+    """The reference configuration is that of `qpos0`: a pose of the file that is none was passed over."""
+    keys = '<keyframe><key name="raised" qpos="0.7"/><key qpos="-0.1"/></keyframe></mujoco>'
+    with pytest.warns(UserWarning, match=r"Left out of the mechanism: keyframes 'raised', 'key 1'\.$"):
+        m.read_mjcf(PENDULUM.replace("</mujoco>", keys))
+
+
 def test_all_that_is_not_supported_is_listed():
     model = """<mujoco><worldbody><body name="a"><joint name="h" armature="0.1"/><joint name="s" type="slide"/>
     <joint name="r"/><geom size=".1"/></body><body name="b"><joint name="g" frictionloss="1" armature="2"/><geom size=".1"/></body>

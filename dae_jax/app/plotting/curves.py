@@ -9,6 +9,10 @@ from jaxtyping import PyTree
 from .common import COLOURS, GREY, Curves, figure_of, legend_below, legend_beside, look, saved, tick_few_decades
 
 
+# Where the arrow of a point stands whose error is above 1.
+ABOVE, ARROW = 2.0, r"$\uparrow$"
+
+
 def drift(curves: Curves, title: str = "Drift off the constraints", unit: str = "", violated: str = "g") -> Any:
     """The largest violation of the constraints until each time, on a log axis; `curves` maps a label to (times, max |g|).
     `violated`: which constraints, in the documentation's symbols.
@@ -103,13 +107,16 @@ def phase_portrait(curves: Curves, position: str, velocity: str, title: str = "P
 
 
 def work_precision(points: Mapping[str, tuple[Sequence[float], Sequence[float]]], title: str = "") -> Any:
-    """Error against run time on log axes, a larger error than 1 cut off; `points` maps a label to (run times in s, errors)."""
+    """Error against run time on log axes; `points` maps a label to (run times in s, errors). An error above 1 is drawn at 1, with an
+    arrow that points upwards.
+    """
     figure, axes = figure_of(8.4, 5.0)
     for i, (label, (times, errors)) in enumerate(points.items()):
-        axes.loglog(times, errors, label=label, **look(label, i))
-    axes.set(xlabel="run time in s", ylabel="largest error against the reference", title=title)
-    if axes.get_ylim()[1] > 2:
-        axes.set_ylim(top=2)
+        style = look(label, i)
+        axes.loglog(times, np.minimum(errors, 1), label=label, **style)
+        beyond = np.asarray(times)[np.asarray(errors) > 1]
+        axes.plot(beyond, np.full(len(beyond), ABOVE), linestyle="", marker=ARROW, color=style["color"], markersize=9)
+    axes.set(xlabel="run time in s", ylabel=f"largest error against the reference ({ARROW}: above 1)", title=title)
     tick_few_decades(axes.xaxis)
     legend_beside(figure)
     return figure
