@@ -13,7 +13,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import PyTree
 
 from .._compat import nextafter, prevbefore
 from ..equations.manifold_ode import Equations
@@ -29,62 +28,49 @@ def has_flow(formulation: AbstractFormulation, y: Y) -> bool:
     return isinstance(formulation, AbstractFieldFormulation) or sum(x.size for x in jax.tree.leaves(y)) <= LARGE
 
 
-def along_flow(y: Y, t: Time, formulation: AbstractFormulation, ode: Equations) -> Any:
-    """y, a point at t that is still: it moves with t as the equations say."""
-    return _later(y, t, (formulation, ode), _rates)
-
-
-def held(y: Y, t: Time, formulation: AbstractFormulation, ode: Equations) -> Any:
-    """y, a point that moves with t, as one at a time that is still: where the flow leads it from t."""
-    return _until(y, t, (formulation, ode), _rates)
-
-
-def _rates(t: Time, y: Y, equations: tuple[AbstractFormulation, Any]) -> Any:
-    formulation, ode = equations
-    return formulation.field(t, y, ode) if isinstance(formulation, AbstractFieldFormulation) else shown_rates(ode, t, y)
-
-
-# Φ(y), the flow to t from where t is, and from t to there: y itself, with all derivatives. Φ′(y) δy is the flow of (y, δy).
 @eqx.filter_custom_jvp
-def _later(y: Y, t: Time, equations: PyTree, rates: Callable[..., Any]) -> Any:  # noqa: ARG001
+def along_flow(y: Y, t: Time, formulation: AbstractFormulation, ode: Equations) -> Any:  # noqa: ARG001
+    """y, a point at t that is still: it moves with t as the equations say. Derivatives by t are right to the fourth."""
     return y
 
 
-@_later.def_jvp
+@along_flow.def_jvp
 def _(primals: Any, tangents: Any) -> Any:
-    y, t, equations, rates = primals
-    dy, dt, changes, _ = tangents
-    if dt is None:
-        return y, dy
-    y, moved = _later((y, _whole(dy, y)), t, (equations, _whole(changes, equations)), functools.partial(_pushed, rates))
-    return y, jax.tree.map(lambda a, b: a + dt * b, moved, rates(t, y, equations))
+    ends = lambda t: (lax.stop_gradient(t), t)
+    return along_flow(*primals), _moved(ends, primals, tangents)
 
 
 @eqx.filter_custom_jvp
-def _until(y: Y, t: Time, equations: PyTree, rates: Callable[..., Any]) -> Any:  # noqa: ARG001
+def held(y: Y, t: Time, formulation: AbstractFormulation, ode: Equations) -> Any:  # noqa: ARG001
+    """y, a point that moves with t, as one at a time that is still: where the equations lead it from t. Derivatives as above."""
     return y
 
 
-@_until.def_jvp
+@held.def_jvp
 def _(primals: Any, tangents: Any) -> Any:
-    y, t, equations, rates = primals
-    dy, dt, changes, _ = tangents
-    if dt is None:
-        return y, dy
-    change = jax.tree.map(lambda a, b: a - dt * b, _whole(dy, y), rates(t, y, equations))
-    return _until((y, change), t, (equations, _whole(changes, equations)), functools.partial(_pushed, rates))
+    ends = lambda t: (t, lax.stop_gradient(t))
+    return held(*primals), _moved(ends, primals, tangents)
 
 
-def _pushed(rates: Callable[..., Any], t: Time, y: Any, equations: Any) -> Any:
-    """The rates of (y, δy), for changes of the equations beside."""
-    return eqx.filter_jvp(lambda *at: rates(t, *at), (y[0], equations[0]), (y[1], equations[1]))
+def _moved(ends: Callable[[Time], tuple[Time, Time]], primals: Any, tangents: Any) -> Any:
+    """How the end of a step of the classical method moves whose length is 0. It is written out: of functions with a rule of their own
+    JAX forgets the rule in what is linear. Also where t does not change: a derivative by t that is taken of it later on counts.
+    """
 
+    def step(y: Y, t: Time, formulation: AbstractFormulation, ode: Equations) -> Any:
+        start, end = ends(t)
+        h = end - start
+        field = formulation.field if isinstance(formulation, AbstractFieldFormulation) else shown_rates
+        plus = lambda h, rates: jax.tree.map(lambda y, rate: y + h * rate, y, rates)
+        first = field(start, y, ode)
+        second = field(start + h / 2, plus(h / 2, first), ode)
+        third = field(start + h / 2, plus(h / 2, second), ode)
+        fourth = field(end, plus(h, third), ode)
+        mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, first, second, third, fourth)
+        return plus(h, mean)
 
-def _whole(changes: PyTree, primals: PyTree) -> Any:
-    """The changes of numbers, zeros where there are none."""
-    numbers = eqx.filter(primals, eqx.is_inexact_array)
-    none = lambda x: x is None
-    return eqx.combine(changes, jax.tree.map(lambda x: x if none(x) else jnp.zeros_like(x), numbers, is_leaf=none))
+    found, pushed = eqx.filter_jvp(step, primals, tangents)
+    return jax.tree.map(lambda x, change: jnp.zeros_like(x) if change is None else change, found, pushed)
 
 
 def jump_times(controller: Any) -> Any:

@@ -14,7 +14,7 @@ from .residual_form import accelerations
 from .structural_ode import underlying_ode
 
 
-def shown_rates(equations: LinearisedResidual, t: Time, y: Flat) -> Any:
+def shown_rates(t: Time, y: Flat, equations: LinearisedResidual) -> Any:
     """ẏ of the unknowns that `decode` looks at, by the equations and their derivatives; 0 of the others."""
     form = equations.form
     if isinstance(form, Index1Form):
