@@ -18,13 +18,13 @@ def shown_rates(t: Time, y: Flat, equations: LinearisedResidual) -> Any:
     """ẏ of the unknowns that `decode` looks at, by the equations and their derivatives; 0 of the others."""
     form = equations.form
     if isinstance(form, Index1Form):
-        of_states = form.ode.field(t, y[: form.ode.orders.size])
-        return jnp.concatenate([of_states, jnp.zeros(y.size - of_states.size, y.dtype)])
+        t, states = jnp.asarray(t, y.dtype), y[: form.ode.orders.size]
+        return jax.jvp(form.encode, (t, states), (jnp.ones_like(t), form.ode.field(t, states)))[1]
     state = form.decode(t, y)
     if is_mechanism(form.system):
         ode = MechanicalODE.of(form.system, t, state, form.args)
         q, v = ode.encode(state)
         return form.encode(ode.decode(t, (v, accelerations(ode, t, (q, v)))))
-    at, ode = underlying_ode(form.system, t, state, form.args)
     t = jnp.asarray(t, y.dtype)
+    at, ode = underlying_ode(form.system, t, state, form.args)
     return form.encode(jax.jvp(ode.decode, (t, at), (jnp.ones_like(t), ode.field(t, at)))[1])
