@@ -60,7 +60,7 @@ def _moved(ends: Callable[[Time], tuple[Time, Time]], primals: Any, tangents: An
     def step(y: Y, t: Time, formulation: AbstractFormulation, ode: Equations) -> Any:
         start, end = ends(t)
         h = end - start
-        field = formulation.field if isinstance(formulation, AbstractFieldFormulation) else shown_rates
+        field: Any = formulation.field if isinstance(formulation, AbstractFieldFormulation) else shown_rates
         plus = lambda h, rates: jax.tree.map(lambda y, rate: y + h * rate, y, rates)
         first = field(start, y, ode)
         second = field(start + h / 2, plus(h / 2, first), ode)
