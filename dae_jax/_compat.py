@@ -6,7 +6,9 @@ The value of a `RESULTS` is read as `result._value` where it is needed: a number
 from diffrax._root_finder import use_stepsize_tol as use_stepsize_tol
 from diffrax._term import WrapTerm as WrapTerm
 from equinox.internal import (
+    nextafter as nextafter,
     nondifferentiable as nondifferentiable,
+    prevbefore as prevbefore,
     unvmap_any as unvmap_any,
     while_loop as while_loop,
 )

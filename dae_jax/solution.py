@@ -225,9 +225,10 @@ class DAESolution(eqx.Module):
         return jax.tree.map(_last, self.ts, self.ys)
 
     def evaluate(self, t0: Time, t1: Time | None = None, left: bool = True) -> Any:
-        """The state at any time, where `SaveAt(dense=True)` was asked for. Its derivative by the time is ẏ there, by the equations; by
-        `RadauIIA5`, `BDF` and other solvers of residuals the slope of what is between steps, of a lower order than the state (of
-        tolerance 1e-8 about 1e-5 off), as are those by times of `SaveAt(ts=...)` and of events.
+        """The state at any time, where `SaveAt(dense=True)` was asked for. At a time in `jump_ts` it is that on the side where the solve
+        comes from, with `left=False` that on the other. Its derivative by the time is ẏ there, by the equations, as are those by times
+        of events; by `RadauIIA5`, `BDF` and other solvers of residuals with more than 256 unknowns the slope of what is between steps,
+        of a lower order than the state (of tolerance 1e-8 about 1e-5 off), as are those by times of `SaveAt(ts=...)`.
         """
         if self.interpolation is None:
             raise ValueError("The solution has no dense output; pass `saveat=diffrax.SaveAt(dense=True)`.")

@@ -1,42 +1,135 @@
-"""Points between the steps of a solve, and how they move with their time.
+"""Points of a solve, and how they move with their time.
 
-The polynomials there have slopes of a lower order than their values. So the derivative of a point by its time is that of the flow of
-the equations through it, not that of the polynomial.
+Steps have ends that are chosen, and between them polynomials, whose slopes are of a lower order than their values; what a step's end
+has to do with its size is of a lower order, too. So the derivative of a point by its time is that of the flow of the equations.
 """
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
+import diffrax
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jax import lax
 
+from .._compat import nextafter, prevbefore
 from ..equations.manifold_ode import Equations
-from ..formulations import AbstractFieldFormulation
-from ..types import Time, Y
+from ..equations.residual_form import LARGE
+from ..equations.shown_rates import shown_rates
+from ..formulations import AbstractFieldFormulation, AbstractFormulation
+from ..solvers.wrapping import AbstractWrapper
+from ..types import BoolLike, Scalar, Time, Y
+
+
+def has_flow(formulation: AbstractFormulation, y: Y) -> bool:
+    """Whether points of the solver's move with a field; that of a large system's residual would be dense."""
+    return isinstance(formulation, AbstractFieldFormulation) or sum(x.size for x in jax.tree.leaves(y)) <= LARGE
 
 
 @eqx.filter_custom_jvp
-def along_flow(y: Y, t: Time, formulation: AbstractFieldFormulation, ode: Equations) -> Any:  # noqa: ARG001
-    """y, a point at t that is still: it moves with t as ẏ = field(t, y) says. Derivatives by t are right to the fourth."""
+def along_flow(y: Y, t: Time, formulation: AbstractFormulation, ode: Equations) -> Any:  # noqa: ARG001
+    """y, a point at t that is still: it moves with t as the equations say. Derivatives by t are right to the fourth."""
     return y
 
 
 @along_flow.def_jvp
 def _(primals: Any, tangents: Any) -> Any:
-    if tangents[1] is None:
-        return primals[0], tangents[0]
-    return eqx.filter_jvp(_runge_kutta, primals, tangents)
+    ends = lambda t: (lax.stop_gradient(t), t)
+    return along_flow(*primals), _moved(ends, primals, tangents)
 
 
-def _runge_kutta(y: Y, t: Time, formulation: AbstractFieldFormulation, ode: Equations) -> Any:
-    """A step of the classical method from y to itself, of the length 0 that grows with t."""
-    start = lax.stop_gradient(t)
-    h = t - start
-    field = lambda t, y: formulation.field(t, y, ode)
-    plus = lambda h, rates: jax.tree.map(lambda y, rate: y + h * rate, y, rates)
-    first = field(start, y)
-    second = field(start + h / 2, plus(h / 2, first))
-    third = field(start + h / 2, plus(h / 2, second))
-    fourth = field(t, plus(h, third))
-    mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, first, second, third, fourth)
-    return plus(h, mean)
+@eqx.filter_custom_jvp
+def held(y: Y, t: Time, formulation: AbstractFormulation, ode: Equations) -> Any:  # noqa: ARG001
+    """y, a point that moves with t, as one at a time that is still: where the equations lead it from t. Derivatives as above."""
+    return y
+
+
+@held.def_jvp
+def _(primals: Any, tangents: Any) -> Any:
+    ends = lambda t: (t, lax.stop_gradient(t))
+    return held(*primals), _moved(ends, primals, tangents)
+
+
+def _moved(ends: Callable[[Time], tuple[Time, Time]], primals: Any, tangents: Any) -> Any:
+    """How the end of a step of the classical method moves whose length is 0. It is written out: of functions with a rule of their own
+    JAX forgets the rule in what is linear. Also where t does not change: a derivative by t that is taken of it later on counts.
+    """
+
+    def step(y: Y, t: Time, formulation: AbstractFormulation, ode: Equations) -> Any:
+        start, end = ends(t)
+        h = end - start
+        field: Any = formulation.field if isinstance(formulation, AbstractFieldFormulation) else shown_rates
+        plus = lambda h, rates: jax.tree.map(lambda y, rate: y + h * rate, y, rates)
+        first = field(start, y, ode)
+        second = field(start + h / 2, plus(h / 2, first), ode)
+        third = field(start + h / 2, plus(h / 2, second), ode)
+        fourth = field(end, plus(h, third), ode)
+        mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, first, second, third, fourth)
+        return plus(h, mean)
+
+    found, pushed = eqx.filter_jvp(step, primals, tangents)
+    return jax.tree.map(lambda x, change: jnp.zeros_like(x) if change is None else change, found, pushed)
+
+
+def jump_times(controller: Any) -> Any:
+    """The times at which a controller knows of jumps, and what it is wrapped around; `None` where there are none."""
+    if controller is None:
+        return None
+    own, inner = getattr(controller, "jump_ts", None), jump_times(getattr(controller, "controller", None))
+    known = [x for x in (own, inner) if x is not None]
+    return jnp.concatenate(known) if known else None
+
+
+def beside(t: Scalar, jumps: Any, left: bool, path: diffrax.DenseInterpolation) -> Any:
+    """t, or where it is one of the `jumps` the number beside it on the side where the solve comes from (`left`) or goes to: what holds
+    at the jump itself may be either.
+    """
+    if jumps is None:
+        return t
+    here = path.direction * t
+    aside = prevbefore(here) if left else nextafter(here)
+    moves = jnp.any(t == jumps) & (aside >= path.ts[0]) & (aside <= path.ts[path.ts_size - 1])
+    return t + lax.stop_gradient(jnp.where(moves, path.direction * aside - t, 0))
+
+
+class StillSteps(AbstractWrapper):
+    """`solver`, whose steps do not move with the times of their ends."""
+
+    solver: diffrax.AbstractSolver
+
+    @property
+    def interpolation_cls(self) -> Any:
+        return _still(self.solver.interpolation_cls)
+
+    def step(
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: Time,
+        t1: Time,
+        y0: Any,
+        args: Any,
+        solver_state: Any,
+        made_jump: BoolLike,
+    ) -> Any:
+        return self.solver.step(terms, *lax.stop_gradient((t0, t1)), y0, args, solver_state, made_jump)
+
+
+@functools.lru_cache(maxsize=64)
+def _still(polynomials: Any) -> Any:
+    """These, without derivatives by times."""
+    return functools.partial(_Still, polynomials)
+
+
+class _Still(diffrax.AbstractLocalInterpolation):
+    t0: Any
+    t1: Any
+    polynomial: Any
+
+    def __init__(self, polynomials: Any, t0: Time, t1: Time, **dense: Any) -> None:
+        self.t0, self.t1 = lax.stop_gradient((t0, t1))
+        self.polynomial = polynomials(t0=self.t0, t1=self.t1, **dense)
+
+    def evaluate(self, t0: Time, t1: Time | None = None, left: bool = True) -> Any:
+        return self.polynomial.evaluate(*lax.stop_gradient((t0, t1)), left)

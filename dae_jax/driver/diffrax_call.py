@@ -14,7 +14,7 @@ from jax import lax
 
 from .._compat import use_stepsize_tol
 from ..equations.manifold_ode import Equations, ManifoldODE
-from ..formulations import AbstractFieldFormulation, AbstractFormulation
+from ..formulations import AbstractFormulation
 from ..linalg import error_norm
 from ..solution import RESULTS, Interpolation, Split
 from ..solvers import (
@@ -26,7 +26,7 @@ from ..solvers import (
     takes_residuals,
 )
 from ..types import BoolScalar, Time, Y
-from .between_steps import along_flow
+from .between_steps import StillSteps, along_flow, beside, has_flow, held, jump_times
 from .bracket import bracketing
 from .crossings import OneCrossing, OnStates
 from .event_functions import known_to_conditions
@@ -49,22 +49,28 @@ if TYPE_CHECKING:
 
 
 class Decode(eqx.Module):
-    """The user's view of a point of the solver's dense output."""
+    """The user's view of a point of the solver's dense output, which moves with its time where steps are `still`, and on its own where
+    they are not.
+    """
 
     formulation: AbstractFormulation
     solver: diffrax.AbstractSolver
+    still: bool = eqx.field(static=True, default=False)
+    # Times that are announced, at which functions may jump.
+    jumps: Any = None
 
     def __call__(self, t: Time, y: Y, ode: Equations) -> Any:
-        return self.formulation.decode(t, self._retracted(t, y, ode), ode)
+        if not self.still:
+            return self.formulation.decode(t, self._retracted(t, y, ode), ode)
+        y = self._retracted(lax.stop_gradient(t), y, ode)
+        return self.formulation.decode(t, along_flow(y, t, self.formulation, ode), ode)
 
     def between(self, path: diffrax.DenseInterpolation, t: Time, left: bool, ode: Equations) -> Any:
-        """The state at any time, whose derivative by it is ẏ where the method has a field."""
-        if not isinstance(self.formulation, AbstractFieldFormulation):
-            return self(t, path.evaluate(t, left=left), ode)
-        t = jnp.asarray(t, path.ts.dtype)
-        still = lax.stop_gradient(t)
-        y = self._retracted(still, path.evaluate(still, left=left), ode)
-        return self.formulation.decode(t, along_flow(y, t, self.formulation, ode), ode)
+        """The state at any time, whose derivative by it is ẏ but in large systems of residuals; on the asked side of a jump."""
+        still = has_flow(self.formulation, path.y0_if_trivial)
+        t = beside(jnp.asarray(t, path.ts.dtype), self.jumps, left, path)
+        y = path.evaluate(lax.stop_gradient(t) if still else t, left=left)
+        return dataclasses.replace(self, still=still)(t, y, ode)
 
     def _retracted(self, t: Time, y: Y, ode: Equations) -> Any:
         return (
@@ -89,7 +95,13 @@ def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[
     """
     t0, t1, dt0, args = problem.t0, problem.t1, problem.dt0, problem.args
     y, ode = solve.encoded(problem)
-    decode = Decode(solve.formulation, solve.solver)
+    event = cast(diffrax.Event | None, solve.event)
+    still = event is not None and has_flow(solve.formulation, y)
+    if still:
+        y = held(y, t0, solve.formulation, ode)
+    decode = Decode(
+        solve.formulation, solve.solver, still, jump_times(solve.controller) if solve.saveat.dense else None
+    )
     solver = economical(solve.solver, solve.between())
     controller = in_integrated(_fitted(solve.controller), t0, y, ode, solve.formulation)
     ode = measured(ode, controller, t0, y)
@@ -113,7 +125,6 @@ def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[
         "end": diffrax.SubSaveAt(t1=True, fn=decode),
     }
     saveat = eqx.tree_at(lambda s: s.subs, solve.saveat, subs, is_leaf=lambda x: x is None)
-    event = cast(diffrax.Event | None, solve.event)
     if event is not None:
         direction, given = jnp.where(t1 < t0, -1, 1), known_to_conditions(solve, problem)
         on_states = lambda c, up: OnStates(c, decode, args, direction, up, given)
@@ -128,7 +139,9 @@ def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[
         observers["ends"] = RecordedEnds(solve.max_steps)
     if takes_residuals(solver) and (records or steps is not None):
         looped = KnownFormulas(looped, solver, None if steps is None else steps.formulas, solve.max_steps or 0)
-    state_is_read = isinstance(looped, KnownFormulas) or counts(solver)
+    known = isinstance(looped, KnownFormulas)
+    looped = StillSteps(looped) if still else looped
+    state_is_read = known or counts(solver)
     saveat = dataclasses.replace(saveat, solver_state=True) if state_is_read else saveat
     passage = passages(problem, ode, solve.formulation.decode, not solve.keeps()[0], solve.formulation.inverts_mass)
     if passage is not None:
@@ -157,7 +170,7 @@ def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[
     starts = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(y)]))
     result = RESULTS.where(starts, RESULTS.promote(sol.result), RESULTS.no_finite_start)
     state: Any = sol.solver_state
-    state, formulas = (state.inner, state.formulas) if isinstance(looped, KnownFormulas) else (state, None)
+    state, formulas = (state.inner, state.formulas) if known else (state, None)
     stats.update((path.split(".")[-1], operator.attrgetter(path)(state)) for path in counts(solver))
     found = lax.stop_gradient(cast(Any, sol.controller_state)).seen if observers else {}
     passed = False

@@ -237,15 +237,30 @@ def bordered_multipliers(
     units: Float[Array, " c"],
 ) -> Float[Array, " c"]:
     """λ at a state, in its `units`, from M v̇ + Aᵀλ = f and A v̇ = −γ: M may be singular."""
-    n, c = ode.layout.size, len(a)
-    if mass is None or n + c > BORDERED:
+    if mass is None or ode.layout.size + len(a) > BORDERED:
         return ode.multipliers(t, y) / units
+    return _bordered(ode, t, y, a, mass, units)[ode.layout.size :]
+
+
+def accelerations(ode: MechanicalODE, t: Time, y: Phase) -> Float[Array, " n"]:
+    """v̇ at a state: M may be singular."""
+    a, mass = ode.constraint_jacobian(t, *y), dense_mass(ode.mass(y[0]))
+    if mass is None or ode.layout.size + len(a) > BORDERED:
+        return ode.field(t, y)[1]
+    return _bordered(ode, t, y, a, mass, jnp.ones(len(a), a.dtype))[: ode.layout.size]
+
+
+def _bordered(
+    ode: MechanicalODE, t: Time, y: Phase, a: Float[Array, "c n"], mass: Float[Array, "..."], units: Float[Array, " c"]
+) -> Float[Array, " nc"]:
+    """(v̇, λ)."""
+    n, c = ode.layout.size, len(a)
     momentum = jnp.concatenate([weighted(mass, jnp.eye(n, dtype=a.dtype)), a.T * units], 1)
     matrix = jnp.concatenate([momentum, jnp.concatenate([a, jnp.zeros((c, c), a.dtype)], 1)])
     right = jnp.concatenate([ode.force(t, *y), -ode.bias(t, *y)])
     largest = jnp.max(jnp.abs(matrix), 1)
     scale = 1 / jnp.where(largest > 0, largest, 1)
-    return solve(matrix * scale[:, None], right * scale)[n:]
+    return solve(matrix * scale[:, None], right * scale)
 
 
 def _names(stem: str, out: PyTree) -> tuple[str, ...]:

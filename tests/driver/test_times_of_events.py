@@ -1,0 +1,79 @@
+"""Derivatives with respect to the times of events, which are those of the flow, and the two sides of a jump that is announced."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix
+import pytest
+
+import dae_jax
+
+
+TOLERANCE = 1e-9
+CONTROL = diffrax.PIDController(rtol=TOLERANCE, atol=TOLERANCE)
+# ẋ = −x z with z = x, so that x = x₀/(1 + x₀ (t − t₀)).
+SYSTEM = dae_jax.SemiExplicitDAE(lambda t, x, z, a: -x * z, lambda t, x, z, a: z - x)
+START = jnp.array([2.0]), jnp.array([2.0])
+
+
+@pytest.mark.parametrize("formulation", [None, dae_jax.DummyDerivatives()], ids=["as written", "dummy derivatives"])
+def test_of_a_reset_in_the_first_steps_after_it(formulation):
+    """x is doubled at T: the first steps of `BDF` are short, and their ends say little of how it moves with their sizes."""
+    doubled = dae_jax.Reset(lambda t, y, a, **_: t - a, lambda t, y, a: (jax.tree.map(lambda u: 2 * u, y), a))
+    after = np.array([1e-6, 1e-4, 1e-2])
+
+    def exact(at, times):
+        x = 4 / (1 + 2 * at)
+        return x / (1 + x * (times - at))
+
+    def found(at):
+        sol = dae_jax.daesolve(
+            SYSTEM, dae_jax.BDF(), 0.0, 0.6, None, START, at, event=doubled, saveat=diffrax.SaveAt(ts=0.5 + after),
+            stepsize_controller=CONTROL, formulation=formulation,
+        )  # fmt: skip
+        return sol.ys[0][:, 0]
+
+    of_exact = jax.jacfwd(exact)(0.5, 0.5 + after)
+    np.testing.assert_allclose(jax.jacfwd(found)(0.5), of_exact, rtol=200 * TOLERANCE)
+
+
+@pytest.mark.parametrize("solver", [diffrax.Tsit5(), dae_jax.RadauIIA5()], ids=lambda s: type(s).__name__)
+def test_second_derivatives_of_the_time_of_an_event(solver):
+    """x = c at 1/c − 1/x₀ exactly, where polynomials between steps have bends that are 1e-6 off."""
+
+    def found(p):
+        event = diffrax.Event(lambda t, y, c, **_: y[0][0] - c, optimistix.Newton(1e-11, 1e-11))
+        start = p[:1], p[:1]
+        sol = dae_jax.daesolve(SYSTEM, solver, 0.0, 3.0, None, start, p[1], event=event, stepsize_controller=CONTROL)
+        return sol.ts[-1]
+
+    exact = lambda p: 1 / p[1] - 1 / p[0]
+    p = jnp.array([2.0, 0.7])
+    np.testing.assert_allclose(jax.hessian(found)(p), jax.hessian(exact)(p), atol=200 * TOLERANCE)
+
+
+METHODS = {
+    "explicit": (dae_jax.DOP853(), None),
+    "dummy": (dae_jax.DOP853(), dae_jax.DummyDerivatives()),
+    "radau": (dae_jax.RadauIIA5(), None),
+    "bdf": (dae_jax.BDF(), None),
+}
+
+
+@pytest.mark.parametrize("end", [2.0, -2.0])
+@pytest.mark.parametrize("method", METHODS)
+def test_both_sides_of_a_jump_that_is_announced(method, end):
+    """ẋ = z, where z = u(t) jumps at half of the way."""
+    solver, formulation = METHODS[method]
+    at = end / 2
+    u = lambda t: jnp.where(t < at, jnp.sin(t), 2 + t)
+    system = dae_jax.SemiExplicitDAE(lambda t, x, z, a: z, lambda t, x, z, a: z - u(t))
+    control = diffrax.ClipStepSizeController(diffrax.PIDController(rtol=1e-8, atol=1e-8), jump_ts=jnp.array([at]))
+    sol = dae_jax.daesolve(
+        system, solver, 0.0, end, None, (jnp.zeros(()), u(0.0)), formulation=formulation, stepsize_controller=control,
+        saveat=diffrax.SaveAt(dense=True),
+    )  # fmt: skip
+    before, after = (np.sin(at), 2 + at) if end > 0 else (2 + at, np.sin(at))
+    np.testing.assert_allclose(sol.evaluate(at, left=True)[1], before, rtol=1e-12)
+    np.testing.assert_allclose(sol.evaluate(at, left=False)[1], after, rtol=1e-12)
