@@ -89,8 +89,9 @@ def daesolve(
       equations as they are written (an index that is too high, or a null space of ∂F/∂ẏ that changes).
     - `stepsize_controller`: by default fixed steps if `dt0` is given, else `PIDController(rtol=1e-8, atol=1e-8)` (1e-5 in
       float32). Where unknowns have units of their own, `rtol` and `atol` may be in the structure of `y0`, with numbers or arrays in
-      place of its arrays, such as `atol=(1e-9, 1e-6)` for (q, v). A derivative ẏ, ÿ, … that is integrated has the tolerance of y, a
-      multiplier that of the velocities along its constraint.
+      place of its arrays, such as `atol=(1e-9, 1e-6)` for (q, v); then units are of no account, that of time neither. A multiplier
+      has the tolerance of the velocities along its constraint, a derivative ẏ, ÿ, … that is integrated that of y; what is absolute of
+      both, in a mechanism, over the time τ in which the velocities' tolerance makes the positions', atol(q) / atol(v), ẍ over τ².
     - `saveat`, `adjoint`, `event`, `max_steps`, `throw`, `progress_meter`: as in diffrax. Functions in `saveat` and
       `event` get the state in the structure of `y0`, and the user's `args`. With a `Reset` as `event` the solve goes on
       after it. Derivatives are those of the numerical solution: where steps leap over a kink of a function (`abs`, `where`, `sort`)

@@ -238,7 +238,7 @@ class Solve:
                 found, through_encoding = jax.vjp(encoded, numbers)
                 of_t0, of_t1, of_ts, of_ys, _, of_stats, *_ = cotangent.numbers
                 of_t1 = of_t1 + of_stats["end_time"]
-                tape = ts["tape"], ys["tape"], None if interpolation is None else interpolation.path.infos
+                tape = ts, ys, None if interpolation is None else interpolation.path.infos
                 of_taped = cotangents(found, Taped(*fixed), fixed_steps, tape, of_ys)
                 (of_arrays,) = through_encoding(saved_times(of_taped, self.saveat.subs, of_t0, of_t1, of_ts))
                 return inexact(if_reached(of_arrays, of_bits(*steps) if steps else None, took_steps(again)))

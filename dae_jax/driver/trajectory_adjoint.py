@@ -52,9 +52,8 @@ def can_be_taped(solve: "Solve", size: int) -> bool:
 
 
 def recorded(saveat: diffrax.SaveAt, stages: bool) -> Any:
-    """`saveat`, with every accepted step saved beside, and its `stages`."""
-    tape = diffrax.SubSaveAt(t0=True, steps=True, fn=as_it_is)
-    return dataclasses.replace(saveat, subs={"user": saveat.subs, "tape": tape}, dense=stages)
+    """`saveat` of every accepted step, and its `stages`, in place of what is asked for, of which nothing is needed once more."""
+    return dataclasses.replace(saveat, subs=diffrax.SubSaveAt(t0=True, steps=True, fn=as_it_is), dense=stages)
 
 
 # What the tape holds: the point in the integration's variables.

@@ -4,7 +4,9 @@ import dataclasses
 import functools
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Array, Float, Int
+
+from ..linalg import powers, take
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,6 +64,15 @@ class Orders:
             if d > 1:
                 found[self.places[1][j]] = j
         return found
+
+    def of_derivatives(
+        self, each: Float[Array, " n"], unit: Float[Array, " n"] | None
+    ) -> tuple[Float[Array, " N"], Float[Array, " n"]]:
+        """For Y and for the derivatives of order Dⱼ what is known for each variable: as it is, or over its unit of time for each order."""
+        lower = take(each, self.owners)
+        if unit is None:
+            return lower, each
+        return lower / powers(take(unit, self.owners), tuple(self.levels.tolist())), each / powers(unit, self.variables)
 
     @property
     def size(self) -> int:

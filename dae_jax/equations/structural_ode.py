@@ -16,7 +16,6 @@ from ..linalg import (
     amplified_roundoff,
     fixed_point,
     implicit_root,
-    powers,
     relative_change,
     row_products,
     semidefinite_solve,
@@ -299,14 +298,9 @@ class StructuralODE(ManifoldODE):
     def derivatives_tolerances(
         self, t: Time, state: State, each: State, absolute: bool
     ) -> tuple[Float[Array, " N"], Float[Array, " n"]]:
-        """Those of Y and of the derivatives of order Dⱼ: that of the variable, an `absolute` one over its time scale for each order."""
-        form, orders = self.form, self.orders
-        own, scale = form.tolerances(t, state, each, absolute), form.time_scale(t, state, each) if absolute else None
-        lower, highest = take(own, orders.owners), own
-        if scale is not None:
-            lower = lower / powers(take(scale, orders.owners), tuple(orders.levels.tolist()))
-            highest = highest / powers(scale, orders.variables)
-        return lower, highest
+        """Those of Y and of the derivatives of order Dⱼ."""
+        scale = self.form.time_scale(t, state, each) if absolute else None
+        return self.orders.of_derivatives(self.form.tolerances(t, state, each, absolute), scale)
 
     def measured_in(self, t: Time, y: Float[Array, " N"], lengths: Float[Array, " N"]) -> "StructuralODE":
         parts, eps = lengths / jnp.max(lengths), float(jnp.finfo(lengths.dtype).eps)
