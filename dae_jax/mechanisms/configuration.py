@@ -165,8 +165,10 @@ def value(
     if kind == "displacement":
         return jnp.sum(difference * rotate(a.rotation, on_a[1][:, axis_of(d)]))
     # Of two points that coincide too c ∂c/∂q has its derivatives, of a spring whose rest is 0 there the stiffness: the added length
-    # is below round-off, and three derivatives of the root stay below what is too large for a number.
-    return jnp.sqrt(jnp.sum(difference**2) + jnp.finfo(difference.dtype).tiny ** 0.4)
+    # is below round-off, and that to the power 1 − 2 n, as in n derivatives of the root, below what is too large for a number.
+    kind_of_number = jnp.finfo(difference.dtype)
+    n = 3 if kind_of_number.bits > 32 else 2
+    return jnp.sqrt(jnp.sum(difference**2) + float(kind_of_number.tiny) ** (2 / (2 * n - 1)))
 
 
 def is_within_half_a_turn(

@@ -26,3 +26,16 @@ def test_a_spring_between_points_that_coincide_has_its_stiffness_there(dimension
     np.testing.assert_allclose(jax.jacrev(force)(still), -stiffness * np.eye(dimension), rtol=1e-14)
     np.testing.assert_allclose(jax.hessian(energy)(still), stiffness * np.eye(dimension), rtol=1e-14)
     np.testing.assert_allclose(jax.hessian(force)(still), 0, atol=1e-30)
+
+
+@pytest.mark.parametrize(("rest", "at", "force", "slope"), [(1e-6, 2e-6, -4e-6, -4), (0.0, 0.0, 0.0, -4)])
+def test_a_short_spring_in_float32(rest, at, force, slope):
+    """Of micrometres, along its line; and one without a length where its points coincide."""
+    with jax.enable_x64(False):
+        body = m.Body("body", 1.0, 0.1)
+        spring = m.spring(m.between(m.ground, body, (np.zeros(2), np.zeros(2))), 4.0, rest)
+        mechanism = m.Mechanism([body], [], [spring])
+        q, v = mechanism.reference
+        along = lambda x: mechanism.force(0.0, q.put("body", q["body"].at[0].add(x)), v, None)["body"][0]
+        found, changes = jax.value_and_grad(along)(jnp.array(at))
+        np.testing.assert_allclose((found, changes), (force, slope), rtol=1e-6)
