@@ -221,7 +221,7 @@ class Solve:
                 arrays, *steps = inputs
                 solve, problem = program.whole(arrays)
                 recording = dataclasses.replace(
-                    solve.forwards(), saveat=recorded(solve.saveat, replays(solve.solver)), recording=True
+                    solve.forwards(), saveat=recorded(replays(solve.solver)), recording=True
                 )
                 record, also_arrays = recording.kernel(problem)
                 again = record(also_arrays, *steps).whole()

@@ -8,7 +8,6 @@ for solvers whose step is a function of its start, or that can `replay` it: of i
 step costs its derivative alone.
 """
 
-import dataclasses
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import diffrax
@@ -51,9 +50,9 @@ def can_be_taped(solve: "Solve", size: int) -> bool:
     )
 
 
-def recorded(saveat: diffrax.SaveAt, stages: bool) -> Any:
-    """`saveat` of every accepted step, and its `stages`, in place of what is asked for, of which nothing is needed once more."""
-    return dataclasses.replace(saveat, subs=diffrax.SubSaveAt(t0=True, steps=True, fn=as_it_is), dense=stages)
+def recorded(stages: bool) -> diffrax.SaveAt:
+    """Every accepted step, and its `stages`, in place of what is asked for, of which nothing is needed once more."""
+    return diffrax.SaveAt(subs=diffrax.SubSaveAt(t0=True, steps=True, fn=as_it_is), dense=stages)
 
 
 # What the tape holds: the point in the integration's variables.
