@@ -6,6 +6,7 @@ The derivative of a function in any mode is a linear map: applied to a direction
 
 import dataclasses
 import functools
+import itertools
 import operator
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -85,13 +86,20 @@ def moved(fn: Callable[[Arrays], Arrays], at: Arrays, moving: Sequence[bool], ch
     return jax.jvp(values, tuple(xs), tuple(changes))[1]
 
 
+def either(*flags: Moving) -> Moving:
+    """What moves in one of them, the shorter ones being of the first arrays."""
+    return tuple(map(any, itertools.zip_longest(*flags, fillvalue=False)))
+
+
 def forward_map(
-    fn: Callable[[Arrays, Arrays], Arrays],
+    fn: Callable[[Moving, Arrays, Arrays], Arrays],
     inexact: Sequence[bool],
     count: int,
     transposed: Callable[[], LinearMap] | None = None,
 ) -> LinearMap:
-    """`fn(at, x)`, linear in the `count` arrays x; its changes are forward derivatives of `fn`, and have no transpose."""
+    """`fn(later, at, x)`, linear in the `count` arrays x; its changes are forward derivatives of `fn`, and have no transpose. `later`:
+    which of the arrays it will be differentiated by.
+    """
     n = len(inexact)
 
     def no_transpose() -> LinearMap:
@@ -101,10 +109,12 @@ def forward_map(
         )
 
     def change(moving: Moving) -> LinearMap:
-        changed = lambda at, changes: moved(lambda a: fn(a, at[n:]), at[:n], moving, changes)
+        def changed(later: Moving, at: Arrays, changes: Arrays) -> Arrays:
+            return moved(lambda a: fn(either(moving, later), a, at[n:]), at[:n], moving, changes)
+
         return forward_map(changed, [*inexact, *[True] * count], sum(moving))
 
-    return LinearMap(as_kernel(fn), inexact, transposed or no_transpose, change)
+    return LinearMap(as_kernel(functools.partial(fn, ())), inexact, transposed or no_transpose, change)
 
 
 def derivative_map(

@@ -18,7 +18,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from .kernel_call import as_kernel
-from .linear_map import Arrays, LinearMap, Moving, batched_alike, forward_map, is_inexact, moved, of_moving
+from .linear_map import Arrays, LinearMap, Moving, batched_alike, either, forward_map, is_inexact, moved, of_moving
 from .settings import one_kernel_enabled
 from .types import TreeDef
 
@@ -111,20 +111,33 @@ class _Changes:
         cotangent = jax.tree.unflatten(self.of_ys, [next(rest) if i else None for i in self.inexact_ys])
         return self.pull_back(jax.tree.unflatten(self.of_xs, xs), cotangent, moving)
 
-    def bent(self, moving: Moving, then: Moving, at: Arrays, dxs: Arrays) -> Arrays:
+    # What moves first, `moving`, may depend on what moves `then` in a way that a function leaves out where that stands still, and so
+    # on with what moves `later`: the inner derivative is by all of them.
+
+    def bent(self, moving: Moving, then: Moving, later: Moving, at: Arrays, dxs: Arrays) -> Arrays:
         """How c·J, at [*x, *c], changes with those that move `then`."""
         n, differentiable = len(self.inexact_xs), self.pulled if self.by_pull_back else self._pulled_forwards
-        return moved(lambda xs: differentiable(moving, xs, at[n:]), at[:n], then, dxs)
+        every = either(moving, then, later)[:n]
+        ours = [m for m, e in zip(moving, every, strict=True) if e]
+        pulled = lambda xs: [x for x, m in zip(differentiable(every, xs, at[n:]), ours, strict=True) if m]
+        return moved(pulled, at[:n], then, dxs)
 
-    def pushed_apart(self, moving: Moving, then: Moving, at: Arrays, dxs: Arrays) -> Arrays:
+    def pushed_apart(self, moving: Moving, then: Moving, later: Moving, at: Arrays, dxs: Arrays) -> Arrays:
         """How J dx, at [*x, *dx], changes with those that move `then`."""
         n = len(self.inexact_xs)
-        return moved(lambda xs: self.pushed(moving, xs, at[n:]), at[:n], then, dxs)
+        every = either(moving, then, later)[:n]
 
-    def pulled_apart(self, moving: Moving, then: Moving, at: Arrays, cotangents: Arrays) -> Arrays:
+        def pushed(xs: Arrays) -> Arrays:
+            rest = iter(at[n:])
+            flags = zip(xs, moving, every, strict=True)
+            return self.pushed(every, xs, [next(rest) if m else jnp.zeros_like(x) for x, m, e in flags if e])
+
+        return moved(pushed, at[:n], then, dxs)
+
+    def pulled_apart(self, moving: Moving, then: Moving, later: Moving, at: Arrays, cotangents: Arrays) -> Arrays:
         """The transpose of that."""
         n = len(self.inexact_xs)
-        return self.bent(then, moving, [*at[:n], *cotangents], at[n:])
+        return self.bent(then, moving, later, [*at[:n], *cotangents], at[n:])
 
     def _pulled_forwards(self, moving: Moving, xs: Arrays, cotangents: Arrays) -> Arrays:
         """c·J by one forward derivative for each number that moves."""

@@ -28,8 +28,15 @@ def has_flow(formulation: AbstractFormulation, y: Y) -> bool:
     return isinstance(formulation, AbstractFieldFormulation) or sum(x.size for x in jax.tree.leaves(y)) <= LARGE
 
 
+class Flow(eqx.Module):
+    """Where points move with their time. `later`: a derivative that is not by it may be differentiated by it later on."""
+
+    formulation: AbstractFormulation
+    later: bool = eqx.field(static=True, default=True)
+
+
 @eqx.filter_custom_jvp
-def along_flow(y: Y, t: Time, formulation: AbstractFormulation, ode: Equations) -> Any:  # noqa: ARG001
+def along_flow(y: Y, t: Time, flow: Flow, ode: Equations) -> Any:  # noqa: ARG001
     """y, a point at t that is still: it moves with t as the equations say. Derivatives by t are right to the fourth."""
     return y
 
@@ -41,7 +48,7 @@ def _(primals: Any, tangents: Any) -> Any:
 
 
 @eqx.filter_custom_jvp
-def held(y: Y, t: Time, formulation: AbstractFormulation, ode: Equations) -> Any:  # noqa: ARG001
+def held(y: Y, t: Time, flow: Flow, ode: Equations) -> Any:  # noqa: ARG001
     """y, a point that moves with t, as one at a time that is still: where the equations lead it from t. Derivatives as above."""
     return y
 
@@ -54,12 +61,16 @@ def _(primals: Any, tangents: Any) -> Any:
 
 def _moved(ends: Callable[[Time], tuple[Time, Time]], primals: Any, tangents: Any) -> Any:
     """How the end of a step of the classical method moves whose length is 0. It is written out: of functions with a rule of their own
-    JAX forgets the rule in what is linear. Also where t does not change: a derivative by t that is taken of it later on counts.
+    JAX forgets the rule in what is linear.
     """
+    (y, _, flow, _), (change, of_t, *_) = primals, tangents
+    if of_t is None and not flow.later:
+        return jax.tree.map(lambda y, dy: jnp.zeros_like(y) if dy is None else dy, y, change)
 
-    def step(y: Y, t: Time, formulation: AbstractFormulation, ode: Equations) -> Any:
+    def step(y: Y, t: Time, flow: Flow, ode: Equations) -> Any:
         start, end = ends(t)
         h = end - start
+        formulation = flow.formulation
         field: Any = formulation.field if isinstance(formulation, AbstractFieldFormulation) else shown_rates
         plus = lambda h, rates: jax.tree.map(lambda y, rate: y + h * rate, y, rates)
         first = field(start, y, ode)
@@ -94,18 +105,31 @@ def beside(t: Scalar, jumps: Any, left: bool, path: diffrax.DenseInterpolation) 
     return t + lax.stop_gradient(jnp.where(moves, path.direction * aside - t, 0))
 
 
+def change_of_jump(jumps: Any, t: Scalar) -> Any:
+    """How the jump that is nearest to t moves, as a number that is 0."""
+    nearest = jumps[jnp.argmin(jnp.abs(jumps - t))]
+    return nearest - lax.stop_gradient(nearest)
+
+
 class StillSteps(AbstractWrapper):
-    """`solver`, whose steps do not move with the times of their ends."""
+    """`solver`, whose steps do not move with the times of their ends. Where a jump that is announced moves, the point after it is where
+    the flow of before leads to, and that of after leads back from.
+    """
 
     solver: diffrax.AbstractSolver
+    flow: Flow
+    jumps: Any = None
 
     @property
     def interpolation_cls(self) -> Any:
         return _still(self.solver.interpolation_cls)
 
+    def init(self, terms: Any, t0: Time, t1: Time, y0: Any, args: Any) -> Any:
+        return self.solver.init(terms, *lax.stop_gradient((t0, t1)), y0, args)
+
     def step(
         self,
-        terms: diffrax.AbstractTerm,
+        terms: Any,
         t0: Time,
         t1: Time,
         y0: Any,
@@ -113,7 +137,16 @@ class StillSteps(AbstractWrapper):
         solver_state: Any,
         made_jump: BoolLike,
     ) -> Any:
-        return self.solver.step(terms, *lax.stop_gradient((t0, t1)), y0, args, solver_state, made_jump)
+        t0, t1 = lax.stop_gradient((t0, t1))
+        if made_jump is not False and self.jumps is not None and self.jumps.size:
+            y0 = lax.cond(made_jump, lambda: self._across(terms.direction, t0, y0, args), lambda: y0)
+        return self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
+
+    def _across(self, direction: Any, t: Time, y: Any, ode: Equations) -> Any:
+        """y, from before the jump that t is just after, to t."""
+        change = change_of_jump(self.jumps, direction * t)
+        before = direction * prevbefore(prevbefore(jnp.asarray(t)))
+        return held(along_flow(y, before + change, self.flow, ode), direction * t + change, self.flow, ode)
 
 
 @functools.lru_cache(maxsize=64)

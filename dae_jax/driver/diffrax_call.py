@@ -26,7 +26,7 @@ from ..solvers import (
     takes_residuals,
 )
 from ..types import BoolScalar, Time, Y
-from .between_steps import StillSteps, along_flow, beside, has_flow, held, jump_times
+from .between_steps import Flow, StillSteps, along_flow, beside, has_flow, held, jump_times
 from .bracket import bracketing
 from .crossings import OneCrossing, OnStates
 from .event_functions import known_to_conditions
@@ -53,29 +53,26 @@ class Decode(eqx.Module):
     they are not.
     """
 
-    formulation: AbstractFormulation
+    flow: Flow
     solver: diffrax.AbstractSolver
-    still: bool = eqx.field(static=True, default=False)
+    still: bool = eqx.field(static=True)
     # Times that are announced, at which functions may jump.
     jumps: Any = None
 
     def __call__(self, t: Time, y: Y, ode: Equations) -> Any:
-        if not self.still:
-            return self.formulation.decode(t, self._retracted(t, y, ode), ode)
-        y = self._retracted(lax.stop_gradient(t), y, ode)
-        return self.formulation.decode(t, along_flow(y, t, self.formulation, ode), ode)
+        of_y = lax.stop_gradient(t) if self.still else t
+        if isinstance(self.solver, AbstractManifoldSolver):
+            y = self.solver.retract(of_y, y, cast(ManifoldODE, ode))
+        y = along_flow(y, t, self.flow, ode) if self.still else y
+        return self.flow.formulation.decode(t, y, ode)
 
     def between(self, path: diffrax.DenseInterpolation, t: Time, left: bool, ode: Equations) -> Any:
         """The state at any time, whose derivative by it is ẏ but in large systems of residuals; on the asked side of a jump."""
-        still = has_flow(self.formulation, path.y0_if_trivial)
+        still = has_flow(self.flow.formulation, path.y0_if_trivial)
         t = beside(jnp.asarray(t, path.ts.dtype), self.jumps, left, path)
         y = path.evaluate(lax.stop_gradient(t) if still else t, left=left)
-        return dataclasses.replace(self, still=still)(t, y, ode)
-
-    def _retracted(self, t: Time, y: Y, ode: Equations) -> Any:
-        return (
-            self.solver.retract(t, y, cast(ManifoldODE, ode)) if isinstance(self.solver, AbstractManifoldSolver) else y
-        )
+        flow = dataclasses.replace(self.flow, later=True)
+        return dataclasses.replace(self, flow=flow, still=still)(t, y, ode)
 
 
 class View(eqx.Module):
@@ -96,12 +93,10 @@ def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[
     t0, t1, dt0, args = problem.t0, problem.t1, problem.dt0, problem.args
     y, ode = solve.encoded(problem)
     event = cast(diffrax.Event | None, solve.event)
-    still = event is not None and has_flow(solve.formulation, y)
+    flow, still, jumps = solve.flow(), solve.is_still(y), jump_times(solve.controller)
     if still:
-        y = held(y, t0, solve.formulation, ode)
-    decode = Decode(
-        solve.formulation, solve.solver, still, jump_times(solve.controller) if solve.saveat.dense else None
-    )
+        y = held(y, t0, flow, ode)
+    decode = Decode(flow, solve.solver, still, jumps if solve.saveat.dense else None)
     solver = economical(solve.solver, solve.between())
     controller = in_integrated(_fitted(solve.controller), t0, y, ode, solve.formulation)
     ode = measured(ode, controller, t0, y)
@@ -140,7 +135,7 @@ def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[
     if takes_residuals(solver) and (records or steps is not None):
         looped = KnownFormulas(looped, solver, None if steps is None else steps.formulas, solve.max_steps or 0)
     known = isinstance(looped, KnownFormulas)
-    looped = StillSteps(looped) if still else looped
+    looped = StillSteps(looped, flow, jumps) if still else looped
     state_is_read = known or counts(solver)
     saveat = dataclasses.replace(saveat, solver_state=True) if state_is_read else saveat
     passage = passages(problem, ode, solve.formulation.decode, not solve.keeps()[0], solve.formulation.inverts_mass)

@@ -14,8 +14,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, Int8, PyTree
 
+from .._compat import nextafter
 from ..equations.manifold_ode import Equations
 from ..types import BoolScalar, IntScalar, Scalar, Y
+from .between_steps import change_of_jump, jump_times
 from .observed_steps import AbstractStepsOf, Step
 
 
@@ -94,8 +96,8 @@ def at_steps(controller: diffrax.AbstractStepSizeController, times: Float[Array,
 
 
 class FollowedSteps(AbstractStepsOf):
-    """Steps with their ends at `times`, all accepted. Like those of another controller they are moved by the start, and the last
-    one ends at t1.
+    """Steps with their ends at `times`, all accepted. Like those of another controller they are moved by the start and by jumps that are
+    announced, and the last one ends at t1.
     """
 
     steps: Any
@@ -141,5 +143,9 @@ class FollowedSteps(AbstractStepsOf):
 
     def _after(self, count: Int[Array, ""], t: Scalar, end: Scalar) -> Any:
         """The end of the step that begins at t."""
-        following = self.times[count + 1]
-        return jnp.where(following >= end, jnp.inf, following + (t - lax.stop_gradient(t)))
+        following, jumps = self.times[count + 1], jump_times(self.steps)
+        change = t - lax.stop_gradient(t)
+        if jumps is not None and jumps.size:
+            at_jump = jnp.any(nextafter(following) == jumps)
+            change = jnp.where(at_jump, change_of_jump(jumps, following), change)
+        return jnp.where(following >= end, jnp.inf, following + change)

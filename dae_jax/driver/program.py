@@ -22,9 +22,10 @@ from ..equations.residual_form import LARGE
 from ..formulations import AbstractFormulation
 from ..solution import DAESolution, Split
 from ..solvers import AbstractManifoldSolver, economical, replays, takes_residuals
-from ..types import BoolScalar, Scalar, State
+from ..types import BoolScalar, Scalar, State, Y
 from ..validate.captured import settled
 from ..validate.user_functions import refuse_wrong_functions, returned
+from .between_steps import Flow, has_flow, held
 from .changes import changing, some_changes, with_changes
 from .diffrax_call import Decode, View, call, failed, steps_of, took_steps
 from .ends import Start, look
@@ -283,9 +284,19 @@ class Solve:
     def _taped(self, problem: Problem) -> Taped:
         y, ode = self.encoded(problem)
         part = self.saveat.subs
-        solver = economical(self.solver, self.between())
-        view = View(part.fn, Decode(self.formulation, self.solver), problem.args)
+        solver, flow, still = economical(self.solver, self.between()), self.flow(), self.is_still(y)
+        y = held(y, problem.t0, flow, ode) if still else y
+        view = View(part.fn, Decode(flow, self.solver, still), problem.args)
         return Taped(self.formulation, solver, part, problem.t0, problem.t1, problem.dt0, y, ode, view)
+
+    def flow(self) -> Flow:
+        """Where points move with their time."""
+        return Flow(self.formulation, later=self.derivative() == "any")
+
+    def is_still(self, y: Y) -> bool:
+        """Whether the steps of a solve from y do not move with times: all but fixed ones, of which the solution is what they give."""
+        moves = self.event is None and not isinstance(self.controller, diffrax.AbstractAdaptiveStepSizeController)
+        return not moves and has_flow(self.formulation, y)
 
     def forwards(self) -> "Solve":
         """The same solve with forward derivatives."""

@@ -73,13 +73,11 @@ class Taped(NamedTuple):
     view: Any
 
     def moving_apart(self, still: PyTree[Array]) -> tuple["Taped", "Taped"]:
-        """What has cotangents and the rest, where these arrays are `still`: what is none of them, and in any case state and times."""
+        """What has cotangents and the rest, where these arrays are `still`: what is none of them, and in any case the state."""
         known = set(map(id, jax.tree.leaves(still)))
         moves = lambda x: eqx.is_inexact_array(x) and id(x) not in known
-        of_equations = {"formulation", "solver", "ode", "view"}
         flags = (
-            jax.tree.map(moves if name in of_equations else eqx.is_inexact_array, part)
-            for name, part in self._asdict().items()
+            jax.tree.map(eqx.is_inexact_array if name == "y" else moves, part) for name, part in self._asdict().items()
         )
         return eqx.partition(self, Taped(*flags))
 
@@ -111,10 +109,15 @@ def cotangents(
     last = jnp.sum(jnp.isfinite(times)) - 1
     last_saved, end = _last_needed(direction, times, save_times, wanted, first)
     end = jnp.minimum(end, last - 1)
+    still = taped.view.decode.still
+    times_move = jax.tree.leaves((numbers.t0, numbers.t1, numbers.dt0, None if part.ts is None else numbers.part.ts))
+    of_ends = (lambda times: times) if times_move and not still else lax.stop_gradient
+    # What is saved moves with its time as the equations say, and not at all where nothing is asked for that.
+    of_flow = (lambda t: t) if times_move else lax.stop_gradient
 
     def saved(numbers: PyTree, t: Time, y: Y) -> Any:
         all_of = eqx.combine(numbers, rest)
-        return all_of.view(t, y, all_of.ode)
+        return all_of.view(of_flow(t), y, all_of.ode)
 
     def parts(numbers: PyTree) -> tuple[Any, Any, Any]:
         all_of = eqx.combine(numbers, rest)
@@ -127,7 +130,7 @@ def cotangents(
         return solver.history_at_start(term, direction * times[0], direction * times[1], _entry(points, 0), ode)
 
     def step(numbers: PyTree, y: Y, history: PyTree, a: Scalar, b: Scalar, known: PyTree[Array]) -> Any:
-        (term, solver, ode), a, b = parts(numbers), direction * a, direction * b
+        (term, solver, ode), (a, b) = parts(numbers), of_ends((direction * a, direction * b))
         if replays(solver):
             y1, history, dense = solver.replay(term, a, b, y, ode, history, known)
         else:
@@ -137,8 +140,8 @@ def cotangents(
 
     def within(numbers: PyTree, moving: PyTree, fixed: PyTree, a: Scalar, b: Scalar, t: Time) -> Any:
         solver = eqx.combine(numbers, rest).solver
-        path = solver.interpolation_cls(t0=direction * a, t1=direction * b, **eqx.combine(moving, fixed))
-        return saved(numbers, t, path.evaluate(direction * t))
+        a, b, at = of_ends((direction * a, direction * b, direction * t))
+        return saved(numbers, t, solver.interpolation_cls(t0=a, t1=b, **eqx.combine(moving, fixed)).evaluate(at))
 
     def shared(k: IntScalar, cotangent: Scalar) -> tuple[Any, Any, Any]:
         """The cotangent of the k-th time as those of t0, t1 and dt0: how diffrax's controllers make it from them."""
@@ -198,8 +201,7 @@ def cotangents(
         more_numbers, of_y, of_history, more_a, more_b = pull_back((of_y, of_history, of_dense))
         (a0, a1, a2), (b0, b1, b2) = shared(k, of_a + more_a), shared(k + 1, of_b + more_b)
         of_numbers = _sum(of_numbers, more_numbers)
-        if fixed_steps:
-            of_numbers = of_numbers._replace(dt0=of_numbers.dt0 + a2 + b2)
+        of_numbers = of_numbers._replace(dt0=_plus(of_numbers.dt0, a2 + b2))
         return k - 1, j, of_y, of_history, of_numbers, of_t0 + a0 + b0, of_t1 + a1 + b1, of_times
 
     of_y, of_numbers, zero = _zeros(_entry(points, 0)), _zeros(numbers), jnp.zeros_like(taped.t0)
@@ -217,23 +219,33 @@ def cotangents(
         _, pull_back = jax.vjp(saved, numbers, taped.t0, taped.y)
         more_numbers, more_t0, more_y = pull_back(_of_start(wanted, first, jnp.where(last > 0, 0, save_times.size)))
         of_numbers, of_t0, of_y = _sum(of_numbers, more_numbers), of_t0 + more_t0, _sum(of_y, more_y)
-    of_numbers = of_numbers._replace(t0=of_numbers.t0 + of_t0, t1=of_numbers.t1 + of_t1, y=_sum(of_numbers.y, of_y))
-    if part.ts is None:
-        return of_numbers
-    return eqx.tree_at(lambda n: n.part.ts, of_numbers, of_numbers.part.ts + of_times)
+    of_numbers = of_numbers._replace(y=_sum(of_numbers.y, of_y))
+    return _with_times(of_numbers, of_t0, of_t1, of_times)
 
 
 def saved_times(
     of_taped: Taped, part: diffrax.SubSaveAt, of_t0: Scalar, of_t1: Scalar, of_ts: Float[Array, " times"]
 ) -> Taped:
     """`cotangents` with those of the times that a solution holds: its t0, t1, and the ts that `part` asks for."""
-    of_part = of_taped.part
-    if part.ts is not None:
+    if part.ts is None:
+        of_times = None
+    else:
         first = int(part.t0)
-        of_part = eqx.tree_at(lambda p: p.ts, of_part, of_part.ts + of_ts[first : first + part.ts.size])
-    of_t0 = of_taped.t0 + of_t0 + (of_ts[0] if part.t0 else 0)
-    of_t1 = of_taped.t1 + of_t1 + (of_ts[-1] if part.t1 else 0)
-    return of_taped._replace(t0=of_t0, t1=of_t1, part=of_part)
+        of_times = of_ts[first : first + part.ts.size]
+    return _with_times(of_taped, of_t0 + (of_ts[0] if part.t0 else 0), of_t1 + (of_ts[-1] if part.t1 else 0), of_times)
+
+
+def _with_times(of_taped: Taped, of_t0: Scalar, of_t1: Scalar, of_times: Array | None) -> Taped:
+    """`of_taped` and what else its times have."""
+    found = of_taped._replace(t0=_plus(of_taped.t0, of_t0), t1=_plus(of_taped.t1, of_t1))
+    if of_taped.part.ts is None:
+        return found
+    return eqx.tree_at(lambda found: found.part.ts, found, of_taped.part.ts + of_times)
+
+
+def _plus(cotangent: Any, more: Any) -> Any:
+    """The sum; `None` where there is no cotangent of what does not move."""
+    return None if cotangent is None else cotangent + more
 
 
 def _last_needed(

@@ -1,0 +1,179 @@
+"""Derivatives with respect to times, of events, of what is saved, of jumps that are announced, which are those of the flow; and the two
+sides of a jump.
+"""
+
+import itertools
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix
+import pytest
+
+import dae_jax
+
+
+TOLERANCE = 1e-9
+CONTROL = diffrax.PIDController(rtol=TOLERANCE, atol=TOLERANCE)
+# ẋ = −x z with z = x, so that x = x₀/(1 + x₀ (t − t₀)).
+SYSTEM = dae_jax.SemiExplicitDAE(lambda t, x, z, a: -x * z, lambda t, x, z, a: z - x)
+START = jnp.array([2.0]), jnp.array([2.0])
+
+
+@pytest.mark.parametrize("formulation", [None, dae_jax.DummyDerivatives()], ids=["as written", "dummy derivatives"])
+def test_of_a_reset_in_the_first_steps_after_it(formulation):
+    """x is doubled at T: the first steps of `BDF` are short, and their ends say little of how it moves with their sizes."""
+    doubled = dae_jax.Reset(lambda t, y, a, **_: t - a, lambda t, y, a: (jax.tree.map(lambda u: 2 * u, y), a))
+    after = np.array([1e-6, 1e-4, 1e-2])
+
+    def exact(at, times):
+        x = 4 / (1 + 2 * at)
+        return x / (1 + x * (times - at))
+
+    def found(at):
+        sol = dae_jax.daesolve(
+            SYSTEM, dae_jax.BDF(), 0.0, 0.6, None, START, at, event=doubled, saveat=diffrax.SaveAt(ts=0.5 + after),
+            stepsize_controller=CONTROL, formulation=formulation,
+        )  # fmt: skip
+        return sol.ys[0][:, 0]
+
+    of_exact = jax.jacfwd(exact)(0.5, 0.5 + after)
+    np.testing.assert_allclose(jax.jacfwd(found)(0.5), of_exact, rtol=200 * TOLERANCE)
+
+
+@pytest.mark.parametrize("solver", [diffrax.Tsit5(), dae_jax.RadauIIA5()], ids=lambda s: type(s).__name__)
+def test_second_derivatives_of_the_time_of_an_event(solver):
+    """x = c at 1/c − 1/x₀ exactly, where polynomials between steps have bends that are 1e-6 off."""
+
+    def found(p):
+        event = diffrax.Event(lambda t, y, c, **_: y[0][0] - c, optimistix.Newton(1e-11, 1e-11))
+        start = p[:1], p[:1]
+        sol = dae_jax.daesolve(SYSTEM, solver, 0.0, 3.0, None, start, p[1], event=event, stepsize_controller=CONTROL)
+        return sol.ts[-1]
+
+    exact = lambda p: 1 / p[1] - 1 / p[0]
+    p = jnp.array([2.0, 0.7])
+    np.testing.assert_allclose(jax.hessian(found)(p), jax.hessian(exact)(p), atol=200 * TOLERANCE)
+
+
+METHODS = {
+    "explicit": (dae_jax.DOP853(), None),
+    "dummy": (dae_jax.DOP853(), dae_jax.DummyDerivatives()),
+    "radau": (dae_jax.RadauIIA5(), None),
+    "bdf": (dae_jax.BDF(), None),
+}
+MODES = {"forward": jax.jacfwd, "reverse": jax.jacrev}
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("method", ["tsit5", "radau"])
+def test_by_the_times_that_are_saved(method, mode):
+    """Between steps slopes of polynomials are 3,415 and 309 tolerances off."""
+    solver = {"tsit5": diffrax.Tsit5(), "radau": dae_jax.RadauIIA5()}[method]
+    system = dae_jax.SemiExplicitDAE(lambda t, x, z, a: -x * z * jnp.cos(t), lambda t, x, z, a: z - x)
+
+    def found(t0, ts):
+        sol = dae_jax.daesolve(
+            system, solver, t0, 2.0, None, START, saveat=diffrax.SaveAt(ts=ts), stepsize_controller=CONTROL
+        )
+        return sol.ys[0][:, 0], sol.ys[1][:, 0]
+
+    def exact(t0, ts):
+        x = 1 / (1 / 2 + jnp.sin(ts) - jnp.sin(t0))
+        return x, x
+
+    at = 0.0, jnp.linspace(0.01, 1.99, 37)
+    for of_found, of_exact in zip(
+        *(jax.tree.leaves(MODES[mode](fn, (0, 1))(*at)) for fn in (found, exact)), strict=True
+    ):
+        np.testing.assert_allclose(of_found, of_exact, atol=200 * TOLERANCE)
+
+
+@pytest.mark.parametrize("modes", [*itertools.product(MODES, MODES)], ids="-".join)
+def test_second_derivatives_by_times_and_by_others(modes):
+    """x = x₀/(1 + x₀ (t − t₀)); by what stands still first, too."""
+    first, then = (MODES[mode] for mode in modes)
+
+    def found(x0, t0, t1):
+        start = x0[None], x0[None]
+        return dae_jax.daesolve(
+            SYSTEM, dae_jax.DOP853(), t0, t1, None, start, stepsize_controller=CONTROL
+        ).ys[0][-1, 0]  # fmt: skip
+
+    exact = lambda x0, t0, t1: x0 / (1 + x0 * (t1 - t0))
+    at = jnp.asarray(2.0), 0.0, 1.5
+    for by, also in [(0, (1, 2)), ((1, 2), 0)]:
+        of_found, of_exact = (jax.tree.leaves(then(first(fn, by), also)(*at)) for fn in (found, exact))
+        np.testing.assert_allclose(of_found, of_exact, atol=200 * TOLERANCE)
+
+
+def test_a_third_derivative_by_a_time_at_last():
+    end = lambda x0, t1: dae_jax.daesolve(
+        SYSTEM, dae_jax.DOP853(), 0.0, t1, None, (x0[None], x0[None]), stepsize_controller=CONTROL
+    ).ys[0][-1, 0]  # fmt: skip
+    exact = lambda x0, t1: x0 / (1 + x0 * t1)
+    third = lambda fn: jax.jacfwd(jax.jacfwd(jax.jacrev(fn)), 1)(jnp.asarray(2.0), 1.5)
+    np.testing.assert_allclose(third(end), third(exact), atol=200 * TOLERANCE)
+
+
+JUMPS = [
+    *itertools.product(METHODS, ["without an event"], MODES),
+    *itertools.product(METHODS, ["backwards"], ["reverse"]),
+    *itertools.product(["explicit", "radau", "bdf"], ["with an event"], ["forward"]),
+]
+
+
+@pytest.mark.parametrize(("method", "ends", "mode"), JUMPS)
+def test_by_the_time_of_a_jump_that_is_announced(method, ends, mode):
+    """ẋ = u(t), which jumps at a: of x after it the derivative by a is the difference of its values there. It was 0."""
+    solver, formulation = METHODS[method]
+    t0, t1 = (2.0, 0.0) if ends == "backwards" else (0.0, 2.0)
+    u = lambda t, a: jnp.where(t < a, jnp.sin(t), 2 + t)
+    system = dae_jax.SemiExplicitDAE(lambda t, x, z, a: z, lambda t, x, z, a: z - u(t, a))
+    event = diffrax.Event(lambda t, y, a, **_: y[0] - 100) if ends == "with an event" else None
+    start = jnp.zeros(()), u(t0, 1.1)
+
+    def found(a):
+        control = diffrax.ClipStepSizeController(CONTROL, jump_ts=a[None])
+        sol = dae_jax.daesolve(
+            system, solver, t0, t1, None, start, a, event=event, formulation=formulation, stepsize_controller=control
+        )
+        return sol.ys[0][-1]
+
+    slope = (jnp.sin(1.1) - 3.1) * (-1 if ends == "backwards" else 1)
+    np.testing.assert_allclose(MODES[mode](found)(jnp.asarray(1.1)), slope, atol=20 * TOLERANCE)
+
+
+def test_by_the_time_of_a_jump_of_many_unknowns_in_steps_that_are_saved():
+    """Beyond 256 unknowns steps move with the times of their ends, those that are taken again, too."""
+    many = jnp.arange(1.0, 131.0)
+    system = dae_jax.SemiExplicitDAE(lambda t, x, z, a: z, lambda t, x, z, a: z - many * jnp.where(t < a, 1.0, 3.0))
+
+    def found(a):
+        control = diffrax.ClipStepSizeController(diffrax.PIDController(rtol=1e-6, atol=1e-6), jump_ts=a[None])
+        sol = dae_jax.daesolve(
+            system, dae_jax.RadauIIA5(), 0.0, 2.0, None, (jnp.zeros(130), many), a,
+            stepsize_controller=control, saveat=diffrax.SaveAt(dense=True), max_steps=64,
+        )  # fmt: skip
+        return sol.evaluate(1.7)[0]
+
+    np.testing.assert_allclose(jax.jacfwd(found)(jnp.asarray(1.1)), -2 * many, rtol=1e-6)
+
+
+@pytest.mark.parametrize("end", [2.0, -2.0])
+@pytest.mark.parametrize("method", METHODS)
+def test_both_sides_of_a_jump_that_is_announced(method, end):
+    """ẋ = z, where z = u(t) jumps at half of the way."""
+    solver, formulation = METHODS[method]
+    at = end / 2
+    u = lambda t: jnp.where(t < at, jnp.sin(t), 2 + t)
+    system = dae_jax.SemiExplicitDAE(lambda t, x, z, a: z, lambda t, x, z, a: z - u(t))
+    control = diffrax.ClipStepSizeController(diffrax.PIDController(rtol=1e-8, atol=1e-8), jump_ts=jnp.array([at]))
+    sol = dae_jax.daesolve(
+        system, solver, 0.0, end, None, (jnp.zeros(()), u(0.0)), formulation=formulation, stepsize_controller=control,
+        saveat=diffrax.SaveAt(dense=True),
+    )  # fmt: skip
+    before, after = (np.sin(at), 2 + at) if end > 0 else (2 + at, np.sin(at))
+    np.testing.assert_allclose(sol.evaluate(at, left=True)[1], before, rtol=1e-12)
+    np.testing.assert_allclose(sol.evaluate(at, left=False)[1], after, rtol=1e-12)
