@@ -33,6 +33,7 @@ def one_kernel(
     forward: Callable[..., Any] | None = None,
     way: Callable[..., PyTree[Array]] | None = None,
     often: bool = True,
+    noticed: Callable[[Arrays, Moving], None] | None = None,
 ) -> Callable[..., Any]:
     """`fn` (pytrees of arrays to a pytree of arrays), compiled to one kernel on the CPU or a GPU where it qualifies.
 
@@ -45,11 +46,14 @@ def one_kernel(
     - `forward`, with "reverse": the same function, with forward derivatives of any order, where `fn` has none.
     - `way(args, result)`, with "reverse": integers that say which way the computation of derivatives goes. These get them as one more
       argument of `fn`, `forward` and `pull_back`, so that they go the same way, whatever their directions are.
+    - `noticed(leaves of args, moving)`, with "reverse", is called when a derivative is traced.
     - `often`: `False` where a result is only looked at: a large kernel is then compiled in the least time.
     """
     if not one_kernel_enabled() or derivative == "any":
         return fn
-    return _forward(fn, often) if derivative == "forward" else _reverse(fn, pull_back, forward or fn, way, often)
+    return (
+        _forward(fn, often) if derivative == "forward" else _reverse(fn, pull_back, forward or fn, way, often, noticed)
+    )
 
 
 def _reverse(
@@ -58,6 +62,7 @@ def _reverse(
     forward: Callable[..., Any],
     way: Callable[..., PyTree[Array]] | None,
     often: bool,
+    noticed: Callable[[Arrays, Moving], None] | None,
 ) -> Callable[..., Any]:
     def flat(*args: PyTree) -> Any:
         leaves, treedef = jax.tree.flatten(args)
@@ -74,6 +79,8 @@ def _reverse(
             ys, of_ys = jax.tree.flatten(out)
             at, of_at = jax.tree.flatten(args_of(xs) if way is None else (*args_of(xs), way(args_of(xs), out)))
             moving = [is_inexact(x) and type(dx) is not SymbolicZero for x, dx in zip(xs, dxs, strict=True)]
+            if noticed is not None:
+                noticed(list(xs), tuple(moving))
             flags = *moving, *[False] * (len(at) - len(xs))
             pulled = pull_back or _plain_pull_back(fn)
             changes = _Changes(

@@ -84,12 +84,17 @@ def _moved(ends: Callable[[Time], tuple[Time, Time]], primals: Any, tangents: An
     return jax.tree.map(lambda x, change: jnp.zeros_like(x) if change is None else change, found, pushed)
 
 
-def jump_times(controller: Any) -> Any:
-    """The times at which a controller knows of jumps, and what it is wrapped around; `None` where there are none."""
+def announced(controller: Any) -> list[Any]:
+    """The times of jumps that a controller knows of, and those of what it is wrapped around."""
     if controller is None:
-        return None
-    own, inner = getattr(controller, "jump_ts", None), jump_times(getattr(controller, "controller", None))
-    known = [x for x in (own, inner) if x is not None]
+        return []
+    own = getattr(controller, "jump_ts", None)
+    return ([] if own is None else [own]) + announced(getattr(controller, "controller", None))
+
+
+def jump_times(controller: Any) -> Any:
+    """All of these; `None` where there are none."""
+    known = announced(controller)
     return jnp.concatenate(known) if known else None
 
 

@@ -14,7 +14,6 @@ from jax import lax
 
 from .._compat import use_stepsize_tol
 from ..equations.manifold_ode import Equations, ManifoldODE
-from ..formulations import AbstractFormulation
 from ..linalg import error_norm
 from ..solution import RESULTS, Interpolation, Split
 from ..solvers import (

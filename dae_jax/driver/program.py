@@ -37,6 +37,7 @@ from .outcome import judged
 from .problem import Problem, Program, split
 from .resets import Reset, solve_with_resets
 from .start import saved_parts
+from .switches import warn_of_moving_switches
 from .tolerances import span_of
 from .trajectory_adjoint import Taped, as_it_is, can_be_taped, cotangents, recorded, saved_times
 
@@ -140,7 +141,8 @@ class Solve:
         pull_back = self._pull_back(problem)
         way = (lambda args, result: as_bits(result.numbers[-1])) if self.records_steps() else self._felt_steps(problem)
         kind = self.derivative() if way is None else "reverse"
-        *fields, end, _ = one_kernel(numbers, kind, pull_back, forward, way)(arrays).whole()
+        noticed = functools.partial(warn_of_moving_switches, split((self, problem))[0])
+        *fields, end, _ = one_kernel(numbers, kind, pull_back, forward, way, noticed=noticed)(arrays).whole()
         check, check_arrays = self._check(problem, end)
         # What is looked at has no derivative.
         found = one_kernel(check, self.derivative(), often=False)(jax.lax.stop_gradient(check_arrays))
