@@ -17,7 +17,7 @@ from ..systems import ConstrainedSystem
 from ..types import Args, Time
 from ..validate.states import brief, refuse_wrong_state
 from ..validate.user_functions import refuse_wrong_functions
-from .bodies import GROUND, numbers
+from .bodies import GROUND, inverse_roots, numbers
 from .configuration import Coordinate, Coordinates, is_within_half_a_turn
 from .joints import Joint
 from .loads import Along
@@ -88,7 +88,7 @@ def _closed(
 
 
 def rank(mechanism: "Mechanism", y0: tuple[Coordinates, Coordinates], t0: Time, args: Args) -> tuple[int, int]:
-    """The numerical rank of the constraints' Jacobians, rows scaled to length 1."""
+    """The numerical rank of the constraints' Jacobians in coordinates scaled by √mass, so that units do not count, rows of length 1."""
     system = mechanism.system()
     refuse_wrong_state(system, y0)
     q, v = y0
@@ -100,10 +100,11 @@ def rank(mechanism: "Mechanism", y0: tuple[Coordinates, Coordinates], t0: Time, 
     rows = [np.zeros((0, len(flat_q)))]
     if system.constraint is not None:
         rows.append(np.asarray(jax.jacfwd(lambda x: mechanism.constraint(t0, of_q(x), args))(flat_q)))
-    holonomic = _rank(np.concatenate(rows))
+    units = np.asarray(inverse_roots(mechanism.mass(q, args)))
+    holonomic = _rank(np.concatenate(rows) * units)
     if system.nonholonomic is not None:
         rows.append(np.asarray(jax.jacfwd(lambda x: mechanism.nonholonomic(t0, q, of_v(x), args))(flat_v)))
-    return holonomic, _rank(np.concatenate(rows))
+    return holonomic, _rank(np.concatenate(rows) * units)
 
 
 def _rank(a: Float[np.ndarray, "m n"]) -> int:
