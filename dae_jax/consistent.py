@@ -233,6 +233,9 @@ def _nearest(ode: MechanicalODE, t: Time, y: Phase, free: Phase) -> Any:
             lambda x: start,
             lambda a, b: jnp.sum(a[: q0.size] * weighted(mass, b[: q0.size])),
             jnp.concatenate([of_q > 0, jnp.zeros_like(of_q, bool)]),
+            jnp.concatenate(
+                [weighted(mass, jnp.ones_like(q0)) if mass is None or mass.ndim < 2 else jnp.diagonal(mass), 0 * q0]
+            ),
         )
 
         def correct(x: Float[Array, " 2n"]) -> Any:

@@ -272,8 +272,11 @@ def shortest(
     """The shortest x with A x = b in the metric of the mass matrix, where entries that are not `free` stay 0."""
     n = mass_solve(of_free(mass, free), (a * free).T)
     schur = jnp.dot(a, n)
+    # Rows of lengths beside those of angles are not dependent because their unit is small or large.
+    scale = unit_diagonal(schur)
+    schur = scale[:, None] * schur * scale
     cut = float(jnp.finfo(schur.dtype).eps) ** 0.5
-    return jnp.dot(n, jnp.dot(jnp.linalg.pinv(schur, rtol=cut, hermitian=True), b))
+    return jnp.dot(n, scale * jnp.dot(jnp.linalg.pinv(schur, rtol=cut, hermitian=True), scale * b))
 
 
 def of_free(mass: Float[Array, "..."] | None, free: Float[Array, " n"]) -> Float[Array, "..."] | None:

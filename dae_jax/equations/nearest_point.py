@@ -30,11 +30,13 @@ def nearest_point(
     aims: Callable[[Float[Array, " n"]], Float[Array, " n"]],
     inner: Callable[[Float[Array, " n"], Float[Array, " n"]], Float[Array, ""]],
     movable: Bool[Array, " n"] | Bool[np.ndarray, " n"],
+    diagonal: Float[Array, " n"] | None = None,
 ) -> Float[Array, " n"]:
     """y on the manifold H(y) = 0 at the least distance from `start`, by Gauss–Newton steps.
 
     `linearised(y, aim)` is the point next to `aim` on the linearisation of H = 0 at y, `aims(y)` what y is to be near to, and
-    |x|² = `inner(x, x)`, in which what is not measured does not occur; `movable` is what is measured and free.
+    |x|² = `inner(x, x)`, in which what is not measured does not occur; `movable` is what is measured and free; `diagonal`, that of
+    the inner product, says how far it is in an entry's own unit.
 
     First onto the manifold. Then a step is as long as makes the merit |y − start| + 3 |A⁺H| less, whose second term is about
     how far y is from the manifold: by the triangle inequality no point off the manifold has less than the nearest one. Full
@@ -52,8 +54,9 @@ def nearest_point(
     def step(carry: Any) -> Any:
         y, way, merit, left, arrived, part, count = carry
         off = jnp.max(jnp.abs(jnp.where(movable, way, 0)), initial=0)
-        # In units of its own, where an entry has any.
-        reach = jnp.where(y == 0, off, jnp.minimum(jnp.abs(y), off))
+        # In units of its own: where an entry is 0 the metric has them, and a way of kilometres is none of a quaternion.
+        far = off if diagonal is None else jnp.where(diagonal > 0, length(way) / jnp.sqrt(diagonal), off)
+        reach = jnp.minimum(jnp.where(y == 0, far, jnp.abs(y)), off)
         aside = jnp.where((count == 1) & movable & (off > noise), ASIDE * reach * directions, 0)
         trial = y + part * way + aside
         new = look(trial, left, arrived)

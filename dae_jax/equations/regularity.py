@@ -188,7 +188,8 @@ def rank_message(
             return None
         return (
             f"The constraints have {stands}, and more beside it: a singular configuration, as a dead centre or a stretched "
-            "linkage is one, from which motion is not determined. Start from another state."
+            "linkage is one, from which motion is not determined. Start from another state; or, where lengths are far from 1 in their "
+            "unit and angles beside them, in another unit."
         )
     if float(found.contradiction) > allowed_contradiction(found.contradiction.dtype):
         return (

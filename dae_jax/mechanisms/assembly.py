@@ -17,9 +17,10 @@ from ..systems import ConstrainedSystem
 from ..types import Args, Time
 from ..validate.states import brief, refuse_wrong_state
 from ..validate.user_functions import refuse_wrong_functions
-from .bodies import GROUND, numbers
-from .configuration import Coordinate, Coordinates
+from .bodies import GROUND, inverse_roots, numbers
+from .configuration import Coordinate, Coordinates, is_within_half_a_turn
 from .joints import Joint
+from .loads import Along
 from .outputs import coordinate_named
 
 
@@ -43,7 +44,12 @@ def assembled(
 ) -> tuple[Coordinates, Coordinates]:
     """The consistent state nearest to a guess, with these values of coordinates and rates."""
     numbers("`t0`", t0, ())
-    start = _start(mechanism, guess)
+    start, at, rates = _start(mechanism, guess), _values("at", at), _values("rates", rates)
+    if at.keys() - rates.keys():
+        # What has a value and no rate moves as the guess does, or as motors move it: places are found at rest, velocities after them.
+        system, rest = _with_values(mechanism, at, {}, t0, at_rest=True), jax.tree.map(jnp.zeros_like, start[1])
+        start = (_closed(mechanism, system, (start[0], rest), t0, args)[0], start[1])
+        at = {name: at[name] for name in at.keys() & rates.keys()}
     found = _closed(mechanism, _with_values(mechanism, at, rates, t0), start, t0, args)
     if not isinstance(found[0].values, Tracer):
         for name, is_reversed in _reversed(mechanism, found[0]).items():
@@ -82,7 +88,7 @@ def _closed(
 
 
 def rank(mechanism: "Mechanism", y0: tuple[Coordinates, Coordinates], t0: Time, args: Args) -> tuple[int, int]:
-    """The numerical rank of the constraints' Jacobians, rows scaled to length 1."""
+    """The numerical rank of the constraints' Jacobians in coordinates scaled by √mass, so that units do not count, rows of length 1."""
     system = mechanism.system()
     refuse_wrong_state(system, y0)
     q, v = y0
@@ -94,10 +100,11 @@ def rank(mechanism: "Mechanism", y0: tuple[Coordinates, Coordinates], t0: Time, 
     rows = [np.zeros((0, len(flat_q)))]
     if system.constraint is not None:
         rows.append(np.asarray(jax.jacfwd(lambda x: mechanism.constraint(t0, of_q(x), args))(flat_q)))
-    holonomic = _rank(np.concatenate(rows))
+    units = np.asarray(inverse_roots(mechanism.mass(q, args)))
+    holonomic = _rank(np.concatenate(rows) * units)
     if system.nonholonomic is not None:
         rows.append(np.asarray(jax.jacfwd(lambda x: mechanism.nonholonomic(t0, q, of_v(x), args))(flat_v)))
-    return holonomic, _rank(np.concatenate(rows))
+    return holonomic, _rank(np.concatenate(rows) * units)
 
 
 def _rank(a: Float[np.ndarray, "m n"]) -> int:
@@ -127,15 +134,32 @@ def _start(mechanism: "Mechanism", guess: Any) -> tuple[Coordinates, Coordinates
                 )
             found_so_far = found_so_far.put(name, row)
         found.append(found_so_far)
-    return found[0], found[1]
+    by_name = () if isinstance(given[0], Coordinates) else tuple(given[0])
+    return _on_its_side(mechanism, found[0], set(by_name)), found[1]
+
+
+def _on_its_side(mechanism: "Mechanism", q: Coordinates, chosen: set[str]) -> Coordinates:
+    """Of e and −e, which are one orientation, springs of angles know one as less than half a turn: that is taken of the bodies whose
+    quaternions are `chosen` by hand, one after the other.
+    """
+    springs = [load.coordinate for load in mechanism.loads if isinstance(load, Along) and load.counts_turns]
+    known = {GROUND, *q.names} - chosen
+    while found := [c for c in springs if (c.on_a.body in known) != (c.on_b.body in known)]:
+        (c, *_) = found
+        new = c.on_a.body if c.on_b.body in known else c.on_b.body
+        at = mechanism.configuration(q)
+        row_a, row_b = (at.rows[at.row(on.body)] for on in (c.on_a, c.on_b))
+        fine = is_within_half_a_turn(row_a, row_b, c.on_a.reference, c.on_b.reference)
+        row = q[new]
+        q, known = q.put(new, jnp.where(fine, row, row.at[3:].multiply(-1))), known | {new}
+    return q
 
 
 def _with_values(
-    mechanism: "Mechanism", at: Mapping[str, Any], rates: Mapping[str, Any], t0: Time
+    mechanism: "Mechanism", at: dict[str, Array], rates: dict[str, Array], t0: Time, at_rest: bool = False
 ) -> ConstrainedSystem:
-    """The mechanism's equations and those that fix values of coordinates and rates."""
+    """The mechanism's equations and those that fix values of coordinates and rates; `at_rest`, those of places in time's standstill."""
     system = mechanism.system()
-    at, rates = _values("at", at), _values("rates", rates)
     if not at and not rates:
         return system
     held = _Held(
@@ -144,8 +168,9 @@ def _with_values(
         at,
         rates,
         jnp.asarray(t0),
+        at_rest,
     )
-    has_rates = system.nonholonomic is not None or set(rates) - set(at)
+    has_rates = not at_rest and (system.nonholonomic is not None or set(rates) - set(at))
     has_positions = system.constraint is not None or at
     return ConstrainedSystem(
         system.force,
@@ -171,9 +196,11 @@ class _Held(eqx.Module):
     at: dict[str, Array]
     rates: dict[str, Array]
     t0: Array
+    at_rest: bool = eqx.field(static=True)
 
     def constraint(self, t: Time, q: Coordinates, args: Args) -> Array:
         """The mechanism's equations of positions, and c − c₀ − ċ₀ (t − t₀)."""
+        t = jnp.asarray(self.t0, q.values.dtype) if self.at_rest else t
         configuration = self.mechanism.configuration(q)
         wanted = {name: c + self.rates.get(name, 0.0) * (t - self.t0) for name, c in self.at.items()}
         extra = [self.coordinates[name].off(configuration, c) for name, c in wanted.items()]
@@ -199,14 +226,15 @@ def _gaps(
     g = jax.jit(lambda x: jnp.ravel(constraint(t0, unflatten(x), args)))
     slope = jax.jit(jax.jacfwd(g))
     rows, closing = mechanism.rows(), _closing(mechanism)
-    g_start, slope_start = np.asarray(g(flat)), np.asarray(slope(flat))
+    in_time = jax.jacfwd(lambda t: jnp.ravel(constraint(t, start[0], args)))(jnp.asarray(t0, flat.dtype))
+    at_start = np.column_stack([g(flat), in_time, slope(flat)])
     for name, (g_rows, _) in rows.items():
-        if not (np.all(np.isfinite(g_start[g_rows])) and np.all(np.isfinite(slope_start[g_rows]))):
+        if not np.all(np.isfinite(at_start[g_rows])):
             raise ValueError(
                 f"The equations of joint {name!r}, or their derivatives, are not finite at this guess, as those of a wheel that lies "
-                "on its plane."
+                "on its plane, or of a motion that begins like √t."
             )
-    weights = np.full(len(g_start), TREE)
+    weights = np.full(len(at_start), TREE)
     for name in closing:
         weights[rows[name][0]] = 1.0
     found = least_squares(

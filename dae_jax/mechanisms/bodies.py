@@ -201,6 +201,12 @@ def mass_block(mass: Float[Array, ""], inertia: Float[Array, "..."], q: Float[Ar
     )
 
 
+def inverse_roots(mass: Float[Array, "..."]) -> Float[Array, " n"]:
+    """1/√ of the masses, and of blocks' diagonals: units of coordinates, whatever that of lengths is; 1 of those that are 0."""
+    sizes = jnp.ravel(mass if mass.ndim == 1 else jnp.diagonal(mass, axis1=1, axis2=2))
+    return jnp.where(sizes > 0, 1 / jnp.sqrt(jnp.where(sizes > 0, sizes, 1)), 1)
+
+
 def inertial_force(inertia: Float[Array, "..."], q: Float[Array, " k"], v: Float[Array, " k"]) -> Float[Array, " k"]:
     """∂T/∂q − Ṁ v."""
     if dimension(q) == 2:

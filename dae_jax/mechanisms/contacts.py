@@ -122,8 +122,12 @@ class Motion(AbstractHolonomicJoint):
         return self.coordinate.on_b
 
     def constraint(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
-        wanted = jnp.reshape(jnp.asarray(self.motion(t, args)), ())
-        return self.coordinate.off(at, wanted)[None]
+        wanted = jnp.asarray(self.motion(t, args))
+        if wanted.size != 1:
+            raise ValueError(
+                f"Motor {self.name!r}: `motion(t, args)` must be a number, but has the shape {wanted.shape}."
+            )
+        return self.coordinate.off(at, jnp.reshape(wanted, ()))[None]
 
     def counts(self, at: Configuration) -> tuple[int, int]:
         return 1, 0

@@ -15,7 +15,7 @@ of control constraints*, Multibody System Dynamics 11 (2004), 343–364.
 
 import functools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,7 @@ from ..consistent import violation
 from ..equations.mechanical import MechanicalODE, allowed_contradiction
 from ..solution import DAESolution
 from ..types import Args, Time
+from .bodies import inverse_roots
 from .configuration import Coordinate, Coordinates
 from .outputs import at_saved_times, coordinate_named, multipliers
 from .paths import LEADING
@@ -89,7 +90,7 @@ def _efforts(
     (mechanism, along), (q, v), taken = what, y, np.array(led)
     ode = MechanicalODE.of(mechanism.system(), t, y, args)
     flat_q, flat_v = ode.encode(y)
-    scale = _inverse_roots(mechanism.mass(q, args))
+    scale = inverse_roots(mechanism.mass(q, args))
     flat = lambda slopes: slopes.values.reshape(-1, scale.size) * scale
     given = flat(jax.jacfwd(lambda q: mechanism.constraint(t, q, args))(q))
     rolling = flat(jax.jacfwd(lambda v: mechanism.nonholonomic(t, q, v, args))(v))
@@ -138,12 +139,6 @@ def _checked(motors: Sequence[str], sol: DAESolution, found: _Found) -> Float[Ar
             "crane's rope, efforts are unknowns of an `ImplicitDAE`, and the path one of its equations."
         )
     return found.tau
-
-
-def _inverse_roots(mass: Any) -> Float[Array, " n"]:
-    """1/√ of the masses, and of blocks' diagonals; 1 of those that are 0."""
-    sizes = jnp.ravel(mass if mass.ndim == 1 else jnp.diagonal(mass, axis1=1, axis2=2))
-    return jnp.where(sizes > 0, 1 / jnp.sqrt(jnp.where(sizes > 0, sizes, 1)), 1)
 
 
 def _free(rows: Float[Array, "m n"]) -> Float[Array, "n n"]:

@@ -68,6 +68,10 @@ class Drive(Law):
             raise ValueError(
                 "`torque(t, c, rate, args)` of a motor must return a real number, but returns a complex one."
             )
+        if given.size != 1:
+            raise ValueError(
+                f"`torque(t, c, rate, args)` of a motor must return a number, but what it returns has the shape {given.shape}."
+            )
         return jnp.reshape(given, ()).astype(c.dtype)
 
     def energy(self, c: Scalar) -> Scalar | None:

@@ -196,8 +196,9 @@ class Mechanism(eqx.Module):
         **Arguments**
 
         - `guess`: coordinates by name, or a pair (q, v) of them; of bodies that are left out, those of the reference configuration.
+          Quaternions may have any length, and either sign, of which that is taken in which springs of angles have their value.
         - `at`, `rates`: values of joints' coordinates, and of their rates, by the joints' names ("joint.angle" where one has
-          several): {"crank": 0.3}.
+          several): {"crank": 0.3}. What has a value and no rate moves as the guess does.
         - `t0`, `args`: for joints that depend on them.
 
         Errors: `ValueError` where the mechanism cannot be assembled: which joint stays open, and by how much. NaN where the
@@ -213,7 +214,8 @@ class Mechanism(eqx.Module):
 
     def coordinate(self, sol: DAESolution, name: str) -> Float[Array, " times"]:
         """The angle, displacement or distance along which a joint, a spring or a motor acts ("joint.angle" where there are several).
-        An angle in space is continuous from one saved time to the next, if it turns by less than π between them.
+        An angle in space is continuous from one saved time to the next, if it turns by less than π between them; an `AccuracyWarning`
+        says where it is too fast for that.
         """
         return outputs.coordinate(self, sol, name)
 

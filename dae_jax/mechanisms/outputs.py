@@ -1,16 +1,19 @@
 """What a mechanism's solution shows: coordinates, efforts, reactions, power; of a batch of solutions with the batch's axes first."""
 
 import functools
+import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from .. import diagnostics, solution
-from ..solution import DAESolution
+from ..solution import AccuracyWarning, DAESolution
 from ..types import Args, State, Time
 from ..validate.captured import current
 from .bodies import GROUND, wrench
@@ -43,8 +46,29 @@ def coordinate_named(mechanism: "Mechanism", name: str) -> Coordinate:
 def coordinate(mechanism: "Mechanism", sol: DAESolution, name: str) -> Float[Array, " times"]:
     """c at each saved time."""
     c = coordinate_named(mechanism, name)
-    values = _at_saved_times((mechanism, c), sol, _value)
-    return jnp.unwrap(values) if c.kind == "angle" and mechanism.dimension == 3 else values
+    if not c.is_turn:
+        return _at_saved_times((mechanism, c), sol, _value)
+    values, rates = _at_saved_times((mechanism, c), sol, _with_rate)
+    _doubt_turns(name, sol.ts, rates)
+    return jnp.unwrap(values)
+
+
+def _doubt_turns(name: str, ts: Float[Array, "*batch times"], rates: Float[Array, "*batch times"]) -> None:
+    """Warns of times at both of which an angle in space turns, the same way, by half a turn or more until the other."""
+    if isinstance(rates, Tracer) or rates.shape[-1] < 2:
+        return
+    times, speeds = np.asarray(ts), np.asarray(rates)
+    turns = np.diff(times) * np.stack([speeds[..., :-1], speeds[..., 1:]])
+    fast = np.min(np.abs(turns), 0) * (turns[0] * turns[1] > 0)
+    if np.any(fast >= np.pi):
+        worst = np.unravel_index(np.nanargmax(fast), fast.shape)
+        span = [f"{float(times[(*worst[:-1], worst[-1] + k)]):.6g}" for k in (0, 1)]
+        warnings.warn(
+            f"Whole turns of {name!r}, an angle in space, are not known: between the saved times {' and '.join(span)} it turns by about "
+            f"{fast[worst]:.3g} rad, as fast as it is there. Save more times.",
+            AccuracyWarning,
+            stacklevel=4,
+        )
 
 
 def rate(mechanism: "Mechanism", sol: DAESolution, name: str) -> Float[Array, " times"]:
@@ -143,6 +167,7 @@ def _work(load: AbstractLoad, t: Time, at: Configuration, args: Args) -> Array:
 
 _value = lambda c, t, at, args: c(at)
 _rate = lambda c, t, at, args: c.with_rate(at)[1]
+_with_rate = lambda c, t, at, args: c.with_rate(at)
 _effort = lambda load, t, at, args: load.effort(t, at, args)
 
 
@@ -162,14 +187,14 @@ def at_saved_times(sol: DAESolution, of: Callable[..., Any], what: tuple["Mechan
 
 
 def _at_saved_times(
-    what: tuple["Mechanism", Any], sol: DAESolution, of: Callable[[Any, Time, Configuration, Args], Array]
-) -> Float[Array, " times"]:
+    what: tuple["Mechanism", Any], sol: DAESolution, of: Callable[[Any, Time, Configuration, Args], Any]
+) -> Any:
     """of(part, t, configuration, args) at each saved time, for a mechanism and a part of it."""
     return at_saved_times(sol, functools.partial(_of_part, of), what)
 
 
 def _of_part(
-    of: Callable[..., Array], what: tuple["Mechanism", Any], t: Time, y: tuple[Coordinates, Coordinates], args: Args
-) -> Array:
+    of: Callable[..., Any], what: tuple["Mechanism", Any], t: Time, y: tuple[Coordinates, Coordinates], args: Args
+) -> Any:
     mechanism, part = what
     return of(part, t, mechanism.configuration(*y), args)

@@ -19,14 +19,15 @@ if TYPE_CHECKING:
     from .mechanism import Mechanism
 
 
-def bodies_of(element: AbstractJoint | AbstractLoad) -> set[str]:
-    """The bodies that a joint or a load names."""
+def bodies_of(element: AbstractJoint | AbstractLoad) -> dict[str, int]:
+    """The bodies that a joint or a load names, and the dimension in which it was made."""
     if isinstance(element, Applied):
-        return {element.body}
+        return {element.body: element.point.shape[0]}
     on = [element.coordinate if isinstance(element, Along) else element]
     if isinstance(element, Coupling):
         on += [element.first, element.second]
-    return {x.body for part in on if isinstance(part, AbstractJoint | Coordinate) for x in (part.on_a, part.on_b)}
+    parts = [part for part in on if isinstance(part, AbstractJoint | Coordinate)]
+    return {x.body: x.point.shape[0] for part in parts for x in (part.on_a, part.on_b)}
 
 
 def refuse_what_does_not_fit(mechanism: "Mechanism", given: Sequence[AbstractJoint | AbstractLoad]) -> None:
@@ -62,10 +63,16 @@ def refuse_what_does_not_fit(mechanism: "Mechanism", given: Sequence[AbstractJoi
     for x in given:
         if isinstance(x, Gravity) and x.acceleration.shape != (mechanism.dimension,):
             raise ValueError(f"{x.name!r} must have {mechanism.dimension} components, but has {x.acceleration.shape}.")
-        for name in sorted(bodies_of(x) - {*names, GROUND}):
-            raise ValueError(
-                f"{x.name!r} is on the body {name!r}, which is none of the mechanism's: {', '.join(names)}."
-            )
+        for name, made_in in bodies_of(x).items():
+            if name not in (*names, GROUND):
+                raise ValueError(
+                    f"{x.name!r} is on the body {name!r}, which is none of the mechanism's: {', '.join(names)}."
+                )
+            if made_in != mechanism.dimension and name != GROUND:
+                this, that = (("planar", "spatial")[d - 2] for d in (made_in, mechanism.dimension))
+                raise ValueError(
+                    f"{x.name!r} was made of a {this} body {name!r}, but the mechanism is {that}: make it of the bodies that are listed."
+                )
 
 
 def refuse_other_bodies(mechanism: "Mechanism", part: Coordinates) -> None:

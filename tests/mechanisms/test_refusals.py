@@ -10,6 +10,8 @@ from dae_jax import mechanisms as m
 
 ROD = m.Body("rod", 1.0, 0.1)
 BLOCK = m.Body("block", 1.0, (0.1, 0.1, 0.1))
+SPATIAL_ROD = m.Body("rod", 1.0, (0.1, 0.1, 0.1))
+SPATIAL = "'ground-rod' was made of a spatial body 'rod', but the mechanism is planar"
 TURN = m.revolute(m.ground, BLOCK, (0, 0, 0), axis=(0, 0, 1))
 TWO_WAYS = m.cylindrical(m.ground, BLOCK, axis=(0, 0, 1), name="h")
 HINGE = m.revolute(m.ground, ROD, (0, 0), name="hinge")
@@ -54,6 +56,11 @@ PAIR = ((0, 0), (1, 0))
         (lambda: m.Mechanism([ROD, BLOCK]), "'rod' is planar and body 'block' is spatial"),
         (lambda: m.Mechanism([BLOCK], [m.revolute(m.ground, ROD, (0, 0))]), "on the body 'rod', which is none"),
         (lambda: m.Mechanism([ROD], [m.revolute(m.ground, ROD, (0, 0))] * 2), "'ground-rod': give one"),
+        (lambda: m.Mechanism([ROD], [m.revolute(m.ground, SPATIAL_ROD, (0, 0, 0), axis=(0, 0, 1))]), SPATIAL),
+        (
+            lambda: m.Mechanism([ROD], [HINGE], [m.torque(SPATIAL_ROD, (0, 0, 1))]),
+            "'torque on rod' was made of a spatial",
+        ),
         (lambda: m.Mechanism([ROD]).assemble({"crank": (0, 0, 0)}), "'crank', which is no body"),
         (lambda: m.Mechanism([ROD]).assemble({"rod": (0, 0)}), "must be 3 numbers"),
         (
@@ -167,6 +174,12 @@ def test_a_joint_without_a_value_at_the_guess_is_named():
         m.Mechanism([wheel], [joint]).assemble()
 
 
+def test_a_motion_without_a_speed_at_the_start_is_named():
+    lifted = m.motor(HINGE, motion=lambda t, args: jnp.sqrt(t), name="lift")
+    with pytest.raises(ValueError, match="The equations of joint 'lift', or their derivatives, are not finite"):
+        m.Mechanism([ROD], [HINGE, lifted]).assemble()
+
+
 def test_what_is_no_state_has_no_rank():
     with pytest.raises(ValueError, match=r"`y0` must be the pair \(q, v\)"):
         HINGED.rank(None)
@@ -235,6 +248,11 @@ def test_what_is_of_another_kind_is_named(make, said: str):
         (m.motor(HINGE, torque=lambda t, c, r, args: ROD.speed * c), "AttributeError: .Body. object has no attribute"),
         (m.motor(HINGE, torque=lambda t, c, r, args: args["T"]), r"args: None: TypeError"),
         (m.motor(HINGE, torque=lambda t: 1.0), r"TypeError: .* takes 1 positional argument"),
+        (
+            m.motor(HINGE, torque=lambda t, c, r, args: jnp.ones(2)),
+            r"return a number, but what it returns has the shape \(2,\)",
+        ),
+        (m.motor(HINGE, motion=lambda t, args: jnp.ones(2), name="drive"), "Motor 'drive': `motion.*has the shape"),
         (m.motor(HINGE, torque=lambda t, c, r, args: 1j * c), "must return a real number, but returns a complex one"),
         (m.force(ROD, (0.0, 1.0, 0.0)), "must have the shape"),
     ],

@@ -38,6 +38,54 @@ def test_a_guess_may_be_a_state_of_some_of_the_bodies():
     np.testing.assert_array_equal(found, by_name)
 
 
+def test_what_has_a_value_and_no_rate_moves_as_the_guess_does():
+    arm = m.Body("arm", 1.0, 0.1, at=(0.5, 0), spin=4.0, velocity=(0, 2.0))
+    free = m.Mechanism([arm], [m.revolute(m.ground, arm, (0, 0), name="h")])
+    # Nearest to the velocities of the guess, in the metric of masses: (J + m r²) ω = J 4 + m r·(0, 2).
+    _, v = free.assemble(at={"h": 0.3})
+    assert float(v["arm"][2]) == pytest.approx((0.1 * 4 + 0.5 * 2 * np.cos(0.3)) / 0.35, rel=1e-9)
+    assert float(free.assemble(at={"h": 0.3}, rates={"h": 0.0})[1]["arm"][2]) == pytest.approx(0, abs=1e-12)
+
+
+def test_what_is_driven_has_the_rate_of_its_motor_where_only_its_value_is_given():
+    drive = m.motor(JOINTS[0], motion=lambda t, args: 0.3 + 2 * t)
+    q, v = m.Mechanism(BODIES, JOINTS, [drive]).assemble(at={"h": 0.3, "k": 0.1})
+    assert float(q["heavy"][2] - q["light"][2]) == pytest.approx(0.1, abs=1e-9)
+    assert float(v["light"][2]) == pytest.approx(2.0, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("length", "mass", "given"),
+    [(1e-4, 1e-9, "rates"), (1e6, 1e9, "at")],
+    ids=["0.1 mm", "in µm"],
+)
+def test_what_is_assembled_is_so_in_any_unit(length, mass, given):
+    def assembled(length, mass):
+        make = lambda name, m0, moments, at: m.Body(name, m0 * mass, moments * mass * length**2, at=at * length)
+        arm = make("arm", 2.0, np.array([0.2, 0.3, 0.25]), np.array([0.3, 0, 0]))
+        bob = make("bob", 1.0, np.array([0.1, 0.15, 0.12]), np.array([0.3, 0.4, 0.2]))
+        hinge = m.revolute(m.ground, arm, (0, 0, 0), axis=(0, 1, 0), name="hinge")
+        pin = m.revolute(arm, bob, np.array([0.3, 0.2, 0]) * length, axis=(1, 0, 0.3), name="pin")
+        mechanism = m.Mechanism([arm, bob], [hinge, pin])
+        q, v = mechanism.assemble(**{given: {"hinge": 0.2} if given == "at" else {"hinge": 1.0, "pin": -2.0}})
+        units = np.array([length] * 3 + [1] * 4)
+        return q.values / units, v.values / units
+
+    for found, right in zip(assembled(length, mass), assembled(1.0, 1.0), strict=True):
+        np.testing.assert_allclose(found, right, atol=1e-9)
+
+
+@pytest.mark.parametrize(("length", "mass"), [(1.0, 1.0), (1e-8, 1e-16), (1e9, 1e6)])
+def test_how_many_equations_are_independent_is_so_in_any_unit(length, mass):
+    """A parallelogram in space: three of its 23 equations follow from the others, and it moves."""
+    make = lambda name, m0, *at: m.Body(name, m0 * mass, np.full(3, 0.1 * mass * length**2), at=np.array(at) * length)
+    left, top, right = make("left", 1.0, 0.3, 0.4, 0), make("top", 2.0, 1.35, 0.8, 0), make("right", 1.3, 1.8, 0.4, 0)
+    ends = [(m.ground, left, (0, 0)), (left, top, (0.6, 0.8)), (top, right, (2.1, 0.8)), (right, m.ground, (1.5, 0))]
+    joints = [m.revolute(a, b, np.array([*at, 0]) * length, axis=(0, 0, 1)) for a, b, at in ends]
+    mechanism = m.Mechanism([left, top, right], joints)
+    assert mechanism.rank(mechanism.reference) == (20, 20)
+
+
 @pytest.mark.parametrize(
     "take",
     [

@@ -8,6 +8,7 @@ import pytest
 
 import dae_jax
 from dae_jax import mechanisms as m
+from dae_jax.mechanisms.bodies import wrench
 
 
 ROD = m.Body("rod", 1.0, (0.1, 0.1, 0.01), at=(0.5, 0, 0))
@@ -49,6 +50,32 @@ def test_a_spring_fails_at_half_a_turn_and_is_right_before():
     )
     with pytest.raises(RuntimeError, match="so is 'spring on hinge', whose angle in space has come to half a turn"):
         solve(1.5)
+
+
+def test_a_spring_takes_either_quaternion_of_an_orientation():
+    """One that a guess has by hand, of any length: e and −e are one orientation, and springs know one of them."""
+    bob = m.Body("bob", 1.0, (0.1, 0.1, 0.1), at=(1.0, 0, 0))
+    pin = m.revolute(ROD, bob, (1, 0, 0), axis=(0, 0, 1), name="pin")
+    mechanism = m.Mechanism([ROD, bob], [HINGE, pin], [m.spring(pin, 2.0), m.spring(HINGE, 1.0)])
+    turned = lambda angle, length: length * np.array([np.cos(angle / 2), 0, 0, np.sin(angle / 2)])
+    rod = np.array([0.5 * np.cos(1.9), 0.5 * np.sin(1.9), 0, *turned(1.9, -1.0)])
+    q, v = mechanism.assemble({"rod": rod, "bob": np.array([np.cos(1.9), np.sin(1.9), 0, *turned(-0.6, 3.0)])})
+    # The bob has turned by −0.6 and the rod by 1.9, with springs at these angles.
+    moments = mechanism.force(0.0, q, v, None)
+    for body, moment in (("rod", 2.0 * -2.5 - 1.9), ("bob", 2.0 * 2.5)):
+        np.testing.assert_allclose(wrench(q[body], moments[body])[1], (0, 0, moment), atol=1e-9)
+
+
+def test_an_angle_that_turns_too_fast_for_its_saved_times_is_doubted():
+    mechanism = m.Mechanism([ROD], [HINGE])
+    y0 = mechanism.assemble(rates={"hinge": -5.0})
+    save = lambda n: diffrax.SaveAt(ts=jnp.linspace(0, 2, n))
+    solve = lambda n: dae_jax.daesolve(mechanism.system(), SOLVER, 0.0, 2.0, None, y0, saveat=save(n))
+    np.testing.assert_allclose(mechanism.coordinate(solve(5), "hinge")[-1], -10.0, rtol=1e-6)
+    with pytest.warns(
+        dae_jax.AccuracyWarning, match="'hinge', an angle in space, .* times 0 and 1 it turns by about 5 rad"
+    ):
+        mechanism.coordinate(solve(3), "hinge")
 
 
 def test_a_load_that_is_not_finite_is_named():
