@@ -53,24 +53,34 @@ def _(primals: Any, tangents: Any) -> Any:
 
 
 def _moved(ends: Callable[[Time], tuple[Time, Time]], primals: Any, tangents: Any) -> Any:
-    """How the end of a step of the classical method moves whose length is 0. It is written out: of functions with a rule of their own
-    JAX forgets the rule in what is linear. Also where t does not change: a derivative by t that is taken of it later on counts.
+    """How the end of a step of no length moves. It is written out: of functions with a rule of their own JAX forgets the rule in what is
+    linear. Also where t does not change: a derivative by t that is taken of it later on counts.
     """
 
     def step(y: Y, t: Time, formulation: AbstractFormulation, ode: Equations) -> Any:
-        start, end = ends(t)
-        h = end - start
-        field: Any = formulation.field if isinstance(formulation, AbstractFieldFormulation) else shown_rates
-        plus = lambda h, rates: jax.tree.map(lambda y, rate: y + h * rate, y, rates)
-        first = field(start, y, ode)
-        second = field(start + h / 2, plus(h / 2, first), ode)
-        third = field(start + h / 2, plus(h / 2, second), ode)
-        fourth = field(end, plus(h, third), ode)
-        mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, first, second, third, fourth)
-        return plus(h, mean)
+        return step_of_no_length(y, *ends(t), formulation, ode)
 
     found, pushed = eqx.filter_jvp(step, primals, tangents)
     return jax.tree.map(lambda x, change: jnp.zeros_like(x) if change is None else change, found, pushed)
+
+
+def step_of_no_length(y: Y, start: Time, end: Time, formulation: AbstractFormulation, ode: Equations) -> Any:
+    """The end of a step of the classical method from `start` to `end`, which are equal but for their derivatives."""
+    h = jnp.asarray(end - start)
+    field: Any = formulation.field if isinstance(formulation, AbstractFieldFormulation) else shown_rates
+    plus = lambda h, y, rates: jax.tree.map(lambda y, rate: y + h * rate, y, rates)
+
+    # A loop, as the field may be large, and its derivatives are larger.
+    def stage(carry: tuple[Y, Y], at: tuple[Scalar, Scalar]) -> Any:
+        rates, total = carry
+        fraction, weight = at
+        rates = field(start + fraction * h, plus(fraction * h, y, rates), ode)
+        return (rates, plus(weight, total, rates)), None
+
+    zero = jax.tree.map(jnp.zeros_like, y)
+    stages = jnp.array([0, 0.5, 0.5, 1], h.dtype), jnp.array([1, 2, 2, 1], h.dtype) / 6
+    (_, total), _ = lax.scan(stage, (zero, zero), stages)
+    return plus(h, y, total)
 
 
 def jump_times(controller: Any) -> Any:
