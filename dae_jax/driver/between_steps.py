@@ -69,16 +69,21 @@ def _moved(ends: Callable[[Time], tuple[Time, Time]], primals: Any, tangents: An
 
     def step(y: Y, t: Time, flow: Flow, ode: Equations) -> Any:
         start, end = ends(t)
-        h = end - start
-        formulation = flow.formulation
+        h, formulation = jnp.asarray(end - start), flow.formulation
         field: Any = formulation.field if isinstance(formulation, AbstractFieldFormulation) else shown_rates
-        plus = lambda h, rates: jax.tree.map(lambda y, rate: y + h * rate, y, rates)
-        first = field(start, y, ode)
-        second = field(start + h / 2, plus(h / 2, first), ode)
-        third = field(start + h / 2, plus(h / 2, second), ode)
-        fourth = field(end, plus(h, third), ode)
-        mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, first, second, third, fourth)
-        return plus(h, mean)
+        plus = lambda h, y, rates: jax.tree.map(lambda y, rate: y + h * rate, y, rates)
+
+        # A loop, as the field may be large, and its derivatives are larger.
+        def stage(carry: tuple[Y, Y], at: tuple[Scalar, Scalar]) -> Any:
+            rates, total = carry
+            fraction, weight = at
+            rates = field(start + fraction * h, plus(fraction * h, y, rates), ode)
+            return (rates, plus(weight, total, rates)), None
+
+        zero = jax.tree.map(jnp.zeros_like, y)
+        stages = jnp.array([0, 0.5, 0.5, 1], h.dtype), jnp.array([1, 2, 2, 1], h.dtype) / 6
+        (_, total), _ = lax.scan(stage, (zero, zero), stages)
+        return plus(h, y, total)
 
     found, pushed = eqx.filter_jvp(step, primals, tangents)
     return jax.tree.map(lambda x, change: jnp.zeros_like(x) if change is None else change, found, pushed)

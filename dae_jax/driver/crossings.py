@@ -47,23 +47,30 @@ class OnStates(eqx.Module):
 
 
 class OneCrossing(AbstractWrapper):
-    """`solver`, with an infinite error of steps within which `conditions` cross zero more than once, down to steps of the length
-    `shortest`, where events are at one time. A controller without tolerances cannot try again: it sees the error.
+    """`solver`, with an infinite error of steps within which `conditions` cross zero more than once, or once where one of the `flags` is
+    true at the end, which is an event there; down to steps of the length `shortest`, where events are at one time. A controller without
+    tolerances cannot try again: it sees the error.
     """
 
     solver: diffrax.AbstractSolver
     conditions: list[Any]
+    flags: list[Any]
     shortest: Scalar
 
     @classmethod
     def of(
-        cls, solver: diffrax.AbstractSolver, conditions: list[Any], formulation: AbstractFormulation, t0: Time, t1: Time
+        cls,
+        solver: diffrax.AbstractSolver,
+        conditions: list[Any],
+        flags: list[Any],
+        formulation: AbstractFormulation,
+        t0: Time,
+        t1: Time,
     ) -> "OneCrossing":
         """For signs, points between steps need not be on the constraints."""
-        conditions = [eqx.tree_at(lambda c: c.decode, c, formulation.decode) for c in conditions]
-        return cls(
-            solver, conditions, jnp.finfo(jnp.result_type(t0)).eps ** 0.5 * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
-        )
+        shortest = jnp.finfo(jnp.result_type(t0)).eps ** 0.5 * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+        decode = lambda conditions: [eqx.tree_at(lambda c: c.decode, c, formulation.decode) for c in conditions]
+        return cls(solver, decode(conditions), flags, shortest)
 
     def step(
         self,
@@ -83,7 +90,9 @@ class OneCrossing(AbstractWrapper):
             at = lambda t, y: jnp.stack([c(t, y, equations) for c in self.conditions])
             between = lax.map(lambda t: at(t, path.evaluate(t)), times)
             values = jnp.concatenate([at(*start)[None], between, at(*end)[None]])
-            several = jnp.sum(values[:-1] * values[1:] < 0) + 2 * jnp.sum(_turns(values)) > 1
+            crossings = jnp.sum(values[:-1] * values[1:] < 0) + 2 * jnp.sum(_turns(values))
+            flagged = jnp.any(jnp.asarray([c(*end, equations) for c in self.flags], bool))
+            several = crossings + flagged > 1
             again = several & (end[0] - start[0] > self.shortest)
             error = jax.tree.map(lambda e: jnp.where(again, jnp.inf, e), error)
         return y1, error, dense_info, solver_state, result

@@ -126,7 +126,7 @@ def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[
         event = dataclasses.replace(event, cond_fn=conditions, root_finder=bracketing(event.root_finder))
     sums_errors = _may_ignore_errors(solve.controller) and not solve.recording
     observers: dict[str, Observer] = {"errors": SummedErrors()} if sums_errors else {}
-    looped = _for_loops(solve, solver, y, _real(event, t0, y, ode), t0, t1)
+    looped = _for_loops(solve, solver, y, *_kinds(event, t0, y, ode), t0, t1)
     records = steps is None and (felt is not None or solve.records_steps())
     if records:
         assert solve.max_steps is not None
@@ -199,14 +199,22 @@ def steps_of(solve: "Solve", problem: Problem, failed: BoolScalar) -> tuple[Step
     return steps, jnp.any(jnp.stack([failed, problem.t0 == problem.t1, at_end, *jax.tree.leaves(event_mask)]))
 
 
-def _real(event: diffrax.Event | None, t: Time, y: Y, ode: Equations) -> list[OnStates]:
-    """The conditions of an event that cross zero; others become true."""
+def _kinds(event: diffrax.Event | None, t: Time, y: Y, ode: Equations) -> tuple[list[OnStates], list[OnStates]]:
+    """The conditions of an event that cross zero, and those that become true."""
     conditions = [] if event is None else jax.tree.leaves(event.cond_fn, is_leaf=callable)
-    return [c for c in conditions if jnp.issubdtype(eqx.filter_eval_shape(c, t, y, ode).dtype, jnp.floating)]
+    crosses = [jnp.issubdtype(eqx.filter_eval_shape(c, t, y, ode).dtype, jnp.floating) for c in conditions]
+    chosen = lambda kind: [c for c, is_real in zip(conditions, crosses, strict=True) if is_real == kind]
+    return chosen(True), chosen(False)
 
 
 def _for_loops(
-    solve: "Solve", solver: diffrax.AbstractSolver, y: Y, conditions: list[OnStates], t0: Time, t1: Time
+    solve: "Solve",
+    solver: diffrax.AbstractSolver,
+    y: Y,
+    conditions: list[OnStates],
+    flags: list[OnStates],
+    t0: Time,
+    t1: Time,
 ) -> Any:
     """The solver as diffrax's loops and its reverse derivative need it; the tape knows accepted steps only."""
     size = sum(leaf.size for leaf in jax.tree.leaves(y))
@@ -215,7 +223,7 @@ def _for_loops(
     )
     by_diffrax = solve.derivative() == "reverse" and not can_be_taped(solve, size)
     solver = WithoutFailedSteps(solver) if ours and by_diffrax else solver
-    return TracedOnce(OneCrossing.of(solver, conditions, solve.formulation, t0, t1) if conditions else solver)
+    return TracedOnce(OneCrossing.of(solver, conditions, flags, solve.formulation, t0, t1) if conditions else solver)
 
 
 def _fitted(controller: diffrax.AbstractStepSizeController) -> Any:

@@ -117,50 +117,6 @@ def test_a_third_derivative_by_a_time_at_last():
     np.testing.assert_allclose(third(end), third(exact), atol=200 * TOLERANCE)
 
 
-JUMPS = [
-    *itertools.product(METHODS, ["without an event"], MODES),
-    *itertools.product(METHODS, ["backwards"], ["reverse"]),
-    *itertools.product(["explicit", "radau", "bdf"], ["with an event"], ["forward"]),
-]
-
-
-@pytest.mark.parametrize(("method", "ends", "mode"), JUMPS)
-def test_by_the_time_of_a_jump_that_is_announced(method, ends, mode):
-    """ẋ = u(t), which jumps at a: of x after it the derivative by a is the difference of its values there. It was 0."""
-    solver, formulation = METHODS[method]
-    t0, t1 = (2.0, 0.0) if ends == "backwards" else (0.0, 2.0)
-    u = lambda t, a: jnp.where(t < a, jnp.sin(t), 2 + t)
-    system = dae_jax.SemiExplicitDAE(lambda t, x, z, a: z, lambda t, x, z, a: z - u(t, a))
-    event = diffrax.Event(lambda t, y, a, **_: y[0] - 100) if ends == "with an event" else None
-    start = jnp.zeros(()), u(t0, 1.1)
-
-    def found(a):
-        control = diffrax.ClipStepSizeController(CONTROL, jump_ts=a[None])
-        sol = dae_jax.daesolve(
-            system, solver, t0, t1, None, start, a, event=event, formulation=formulation, stepsize_controller=control
-        )
-        return sol.ys[0][-1]
-
-    slope = (jnp.sin(1.1) - 3.1) * (-1 if ends == "backwards" else 1)
-    np.testing.assert_allclose(MODES[mode](found)(jnp.asarray(1.1)), slope, atol=20 * TOLERANCE)
-
-
-def test_by_the_time_of_a_jump_of_many_unknowns_in_steps_that_are_saved():
-    """Beyond 256 unknowns steps move with the times of their ends, those that are taken again, too."""
-    many = jnp.arange(1.0, 131.0)
-    system = dae_jax.SemiExplicitDAE(lambda t, x, z, a: z, lambda t, x, z, a: z - many * jnp.where(t < a, 1.0, 3.0))
-
-    def found(a):
-        control = diffrax.ClipStepSizeController(diffrax.PIDController(rtol=1e-6, atol=1e-6), jump_ts=a[None])
-        sol = dae_jax.daesolve(
-            system, dae_jax.RadauIIA5(), 0.0, 2.0, None, (jnp.zeros(130), many), a,
-            stepsize_controller=control, saveat=diffrax.SaveAt(dense=True), max_steps=64,
-        )  # fmt: skip
-        return sol.evaluate(1.7)[0]
-
-    np.testing.assert_allclose(jax.jacfwd(found)(jnp.asarray(1.1)), -2 * many, rtol=1e-6)
-
-
 @pytest.mark.parametrize("end", [2.0, -2.0])
 @pytest.mark.parametrize("method", METHODS)
 def test_both_sides_of_a_jump_that_is_announced(method, end):

@@ -381,6 +381,16 @@ def test_the_first_of_two_events_within_a_step(order):
     np.testing.assert_allclose(both.ts[-1], 1.5, atol=1e-10)
 
 
+@pytest.mark.parametrize("flag", [1.4, 0.9])
+def test_of_a_crossing_and_a_flag_within_a_step(flag):
+    """A flag is an event at the end of a step, and was taken for the first where it is first in the list."""
+    conditions = [lambda t, y, a, **_: t > flag, lambda t, y, a, **_: t - 1.2]
+    sol = thrown(diffrax.Event(conditions, optimistix.Newton(1e-10, 1e-10)), diffrax.Tsit5(), 0.0, 2.0)
+    time = float(sol.ts[-1])
+    assert [bool(x) for x in sol.event_mask] == [flag < 1.2, flag > 1.2]
+    assert flag < time < 1.2 if flag < 1.2 else abs(time - 1.2) < 1e-10
+
+
 @pytest.mark.parametrize(
     "adjoint", [diffrax.RecursiveCheckpointAdjoint(), diffrax.ForwardMode()], ids=["reverse", "forward"]
 )

@@ -144,3 +144,47 @@ def test_a_reset_has_the_derivative_by_a_switching_time():
     for derivative in (jax.grad, jax.jacfwd):
         np.testing.assert_allclose(derivative(with_reset)(0.7), 2.0, rtol=1e-9)
         assert derivative(by_where)(0.7) == 0
+
+
+SWITCHED = {
+    "jump": lambda t, a: jnp.where(t < a["time"], 0.0, a["size"]),
+    "pulses": lambda t, a: jnp.where(t % 1.0 < a["time"], a["size"], 0.0),
+    "sign": lambda t, a: a["size"] * jnp.sign(t - a["time"]),
+}
+STILL = {
+    "ramp": lambda t, a: a["size"] * jnp.maximum(0.0, t - a["time"]),
+    "fixed": lambda t, a: jnp.where(t < 1.0, 0.0, a["size"] * a["time"]),
+    "size": lambda t, a: a["time"] * jnp.where(t < a["size"], 0.0, 1.0),
+}
+
+
+class TestDerivatives:
+    """By the time of a switch, which is known to them only where it is announced as it depends on what they are by."""
+
+    def traced(self, of, announced=None):
+        system = dae_jax.SemiExplicitDAE(lambda t, x, z, a: z, lambda t, x, z, a: z - of(t, a))
+
+        def end(time):
+            args = {"time": time, "size": jnp.ones(())}
+            control = diffrax.PIDController(rtol=1e-6, atol=1e-6)
+            if announced is not None:
+                control = diffrax.ClipStepSizeController(control, jump_ts=announced(time))
+            start = jnp.zeros(()), jnp.zeros(())
+            return dae_jax.daesolve(
+                system, dae_jax.DOP853(), 0.0, 2.0, None, start, args, stepsize_controller=control
+            ).ys[0][-1]  # fmt: skip
+
+        jax.eval_shape(jax.grad(end), jnp.asarray(1.1))
+
+    @pytest.mark.parametrize("name", SWITCHED)
+    @pytest.mark.parametrize("announced", [None, lambda time: jnp.array([1.1])], ids=["unknown", "as a constant"])
+    def test_warn(self, name, announced):
+        with pytest.warns(AccuracyWarning, match="switch at a time that depends on what is differentiated"):
+            self.traced(SWITCHED[name], announced)
+
+    @pytest.mark.parametrize("name", STILL)
+    def test_do_not_where_no_jump_moves(self, name):
+        self.traced(STILL[name])
+
+    def test_do_not_where_it_is_known(self):
+        self.traced(SWITCHED["jump"], lambda time: time[None])
