@@ -76,7 +76,16 @@ def some_changes(solve: "Solve", problem: Problem, end: tuple[Time, State], cons
 def _by_no_pattern(tree: PyTree[Array], sizes: Callable[[Array], Array]) -> Any:
     numbers, unflatten = ravel_pytree(tree)
     # Parameters may be complex.
-    return unflatten((sizes(numbers) * _no_pattern(numbers.size)).astype(numbers.dtype))
+    changes = unflatten((sizes(numbers) * _no_pattern(numbers.size)).astype(numbers.dtype))
+    return jax.tree.map(_as_symmetric, tree, changes)
+
+
+def _as_symmetric(x: Array, change: Array) -> Array:
+    """A matrix of masses or of inertia stays symmetric."""
+    if x.ndim < 2 or x.shape[-1] != x.shape[-2] or x.shape[-1] == 1:
+        return change
+    transposed = lambda x: jnp.swapaxes(x, -1, -2)
+    return jnp.where(jnp.all(x == transposed(x)), (change + transposed(change)) / 2, change)
 
 
 def _no_pattern(size: int) -> Flat:

@@ -82,7 +82,8 @@ def warn_of_moving_switches(program: Program, arrays: Arrays, moving: Moving) ->
     """Warns of comparisons of the time with what depends on those `arrays` of a solve that are `moving`, but where times that are
     announced move with these.
     """
-    solve, _ = program.whole(moving)
+    flags: list[Any] = list(moving)
+    solve, _ = program.whole(flags)
     if any(announced(solve.controller)):
         return
     _, problem = program.whole(arrays)
