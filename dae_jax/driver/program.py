@@ -287,7 +287,8 @@ class Solve:
         y, ode = self.encoded(problem)
         part = self.saveat.subs
         solver, flow, still = economical(self.solver, self.between()), self.flow(), self.is_still(y)
-        y = held(y, problem.t0, flow, ode) if still else y
+        start = jnp.where(problem.t0 == problem.t1, jax.lax.stop_gradient(problem.t0), problem.t0)
+        y = held(y, start, flow, ode) if still else y
         view = View(part.fn, Decode(flow, self.solver, still), problem.args)
         return Taped(self.formulation, solver, part, problem.t0, problem.t1, problem.dt0, y, ode, view)
 

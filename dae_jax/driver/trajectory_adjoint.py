@@ -112,8 +112,8 @@ def cotangents(
     still = taped.view.decode.still
     times_move = jax.tree.leaves((numbers.t0, numbers.t1, numbers.dt0, None if part.ts is None else numbers.part.ts))
     of_ends = (lambda times: times) if times_move and not still else lax.stop_gradient
-    # What is saved moves with its time as the equations say, and not at all where nothing is asked for that.
-    of_flow = (lambda t: t) if times_move else lax.stop_gradient
+    # What is saved moves with its time as the equations say, but where no step is taken; and not at all where nothing is asked for that.
+    of_flow = (lambda t: jnp.where(last > 0, t, lax.stop_gradient(t))) if times_move else lax.stop_gradient
 
     def saved(numbers: PyTree, t: Time, y: Y) -> Any:
         all_of = eqx.combine(numbers, rest)
