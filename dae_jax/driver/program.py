@@ -293,8 +293,10 @@ class Solve:
         return Taped(self.formulation, solver, part, problem.t0, problem.t1, problem.dt0, y, ode, view)
 
     def flow(self) -> Flow:
-        """Where points move with their time."""
-        return Flow(self.formulation, later=self.derivative() == "any")
+        """Where points move with their time: the time of an event is that where a condition is zero, whose derivative by others, at that
+        time, has one by it.
+        """
+        return Flow(self.formulation, later=self.derivative() == "any" or self.event is not None)
 
     def is_still(self, y: Y) -> bool:
         """Whether the steps of a solve from y do not move with times: all but fixed ones, of which the solution is what they give."""
