@@ -287,6 +287,7 @@ class Solve:
         y, ode = self.encoded(problem)
         part = self.saveat.subs
         solver, flow, still = economical(self.solver, self.between()), self.flow(), self.is_still(y)
+        # An interval without length has no derivatives by its times.
         start = jnp.where(problem.t0 == problem.t1, jax.lax.stop_gradient(problem.t0), problem.t0)
         y = held(y, start, flow, ode) if still else y
         view = View(part.fn, Decode(flow, self.solver, still), problem.args)

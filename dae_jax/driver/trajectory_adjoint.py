@@ -110,7 +110,7 @@ def cotangents(
     last_saved, end = _last_needed(direction, times, save_times, wanted, first)
     end = jnp.minimum(end, last - 1)
     still = taped.view.decode.still
-    times_move = jax.tree.leaves((numbers.t0, numbers.t1, numbers.dt0, None if part.ts is None else numbers.part.ts))
+    times_move = jax.tree.leaves((numbers.t0, numbers.t1, numbers.dt0, numbers.part.ts))
     of_ends = (lambda times: times) if times_move and not still else lax.stop_gradient
     # What is saved moves with its time as the equations say, but where no step is taken; and not at all where nothing is asked for that.
     of_flow = (lambda t: jnp.where(last > 0, t, lax.stop_gradient(t))) if times_move else lax.stop_gradient
@@ -227,11 +227,8 @@ def saved_times(
     of_taped: Taped, part: diffrax.SubSaveAt, of_t0: Scalar, of_t1: Scalar, of_ts: Float[Array, " times"]
 ) -> Taped:
     """`cotangents` with those of the times that a solution holds: its t0, t1, and the ts that `part` asks for."""
-    if part.ts is None:
-        of_times = None
-    else:
-        first = int(part.t0)
-        of_times = of_ts[first : first + part.ts.size]
+    first = int(part.t0)
+    of_times = None if part.ts is None else of_ts[first : first + part.ts.size]
     return _with_times(of_taped, of_t0 + (of_ts[0] if part.t0 else 0), of_t1 + (of_ts[-1] if part.t1 else 0), of_times)
 
 
