@@ -109,7 +109,7 @@ def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[
         dt0 = first_step(ode.start, solver, t0, t1, y) if chosen else dt0
     else:
         controller = in_one_vector(_with_smallest_step(controller, t0, t1), y)
-        solver = _with_tolerances_within(solver, controller)
+        solver = _filled_in(solver, controller, solve.adjoint)
 
     def saved(part: diffrax.SubSaveAt) -> Any:
         return part if part.fn is as_it_is else eqx.tree_at(lambda s: s.fn, part, View(part.fn, decode, args))
@@ -252,17 +252,24 @@ def _may_ignore_errors(controller: Any) -> bool:
     )
 
 
-def _with_tolerances_within(solver: Any, controller: diffrax.AbstractStepSizeController) -> Any:
-    """A solver around an implicit one of diffrax that takes its tolerances from the controller: diffrax looks for those of the
-    outer one only.
+def _filled_in(solver: Any, controller: diffrax.AbstractStepSizeController, adjoint: diffrax.AbstractAdjoint) -> Any:
+    """An implicit solver of diffrax, within however many others, with what diffrax fills in for it in the outermost two only: the
+    controller's tolerances where it has none, and loops that can be differentiated as the `adjoint` asks for.
     """
-    finder = getattr(getattr(solver, "solver", None), "root_finder", None)
-    open_ones = [name for name in ("rtol", "atol", "norm") if getattr(finder, name, None) is use_stepsize_tol]
-    if not open_ones or not isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
+    inner = getattr(solver, "solver", None)
+    if inner is not None:
+        return dataclasses.replace(solver, solver=_filled_in(inner, controller, adjoint))
+    finder: Any = getattr(solver, "root_finder", None)
+    if finder is None:
         return solver
-    found = {name: getattr(controller, name) for name in open_ones}
-    inner = dataclasses.replace(solver.solver, root_finder=dataclasses.replace(cast(Any, finder), **found))
-    return dataclasses.replace(solver, solver=inner)
+    changed: dict[str, Any] = {}
+    if isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
+        open_ones = [name for name in ("rtol", "atol", "norm") if getattr(finder, name, None) is use_stepsize_tol]
+        changed["root_finder"] = dataclasses.replace(finder, **{name: getattr(controller, name) for name in open_ones})
+    if getattr(solver, "scan_kind", "") is None:
+        kinds = {"lax": diffrax.ForwardMode, "bounded": diffrax.DirectAdjoint}
+        changed["scan_kind"] = next((loops for loops, kind in kinds.items() if isinstance(adjoint, kind)), None)
+    return dataclasses.replace(solver, **changed)
 
 
 def _with_tolerances_of(controller: diffrax.AbstractStepSizeController, solver: diffrax.AbstractSolver) -> Any:

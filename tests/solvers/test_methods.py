@@ -172,14 +172,35 @@ def test_backwards_in_time_with_a_constraint_that_depends_on_time(solver):
     assert dae_jax.drift(scene.system, sol).position.max() < 1e-13
 
 
-def test_an_implicit_method_of_diffrax_is_projected():
-    """Its tolerances are those of the controller, which diffrax hands to a solver that stands alone only."""
-    scene = pendulum()
+# Of any gravity (`args`).
+SYSTEM = dae_jax.ConstrainedSystem(lambda t, q, v, g: jnp.stack([0 * g, g]), SCENE.system.constraint)
+IMPLICIT = {"alone": diffrax.Kvaerno5(), "projected": dae_jax.OrthogonalProjection(diffrax.Kvaerno5())}
+
+
+@pytest.mark.parametrize("solver", IMPLICIT.values(), ids=IMPLICIT)
+def test_an_implicit_method_of_diffrax_has_the_controllers_tolerances(solver):
+    """Which diffrax hands to a solver that stands alone only."""
     times = np.linspace(0, 1, 11)
     for tolerance, error in ((1e-5, 1e-3), (1e-8, 1e-6)):
-        sol = dae_jax.daesolve(
-            scene.system, dae_jax.OrthogonalProjection(diffrax.Kvaerno5()), 0.0, 1.0, None, scene.y0, scene.args,
-            saveat=diffrax.SaveAt(ts=jnp.asarray(times)), stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
-        )  # fmt: skip
-        assert scene.error(times, sol.ys) < error
-        assert float(dae_jax.drift(scene.system, sol).position.max()) < 1e-14
+        sol = solve_to(solver, 9.81, tolerance, saveat=diffrax.SaveAt(ts=times))
+        assert SCENE.error(times, sol.ys) < error
+        if solver is IMPLICIT["projected"]:
+            assert float(dae_jax.drift(SYSTEM, sol).position.max()) < 1e-14
+
+
+@pytest.mark.parametrize("solver", IMPLICIT.values(), ids=IMPLICIT)
+@pytest.mark.parametrize("adjoint", [diffrax.ForwardMode(), diffrax.DirectAdjoint()], ids=["forward", "direct"])
+def test_an_implicit_method_of_diffrax_has_forward_derivatives(solver, adjoint):
+    """Its loops within a step have them if diffrax is told so."""
+    end = lambda gravity, adjoint: solve_to(solver, gravity, 1e-9, adjoint=adjoint).final[0]
+    found = jax.jacfwd(lambda gravity: end(gravity, adjoint))(9.81)
+    plain, h = diffrax.RecursiveCheckpointAdjoint(), 1e-4
+    central = (end(9.81 + h, plain) - end(9.81 - h, plain)) / (2 * h)
+    np.testing.assert_allclose(found, central, rtol=1e-5, atol=1e-7)
+
+
+def solve_to(solver, gravity, tolerance, **options):
+    controller = diffrax.PIDController(tolerance, tolerance)
+    return dae_jax.daesolve(
+        SYSTEM, solver, 0.0, 1.0, None, SCENE.y0, gravity, stepsize_controller=controller, **options
+    )
