@@ -170,8 +170,8 @@ def consistent_state(
       whose derivative occurs in the equations. All entries of the state then count alike for mechanisms also.
     - `yd0`: near which ẏ is looked for, for an `ImplicitDAE` that is nonlinear in it.
 
-    Errors: `ValueError` where no such state is found from here, naming the equations that remain off; NaN where the
-    arguments are traced; `NotImplementedError` for its derivative where it has more than 256 unknowns and hidden equations.
+    Errors: `ValueError` where no such state is found from here, naming the equations that remain off; NaN within `jit` and
+    `vmap`; `NotImplementedError` for its derivative where it has more than 256 unknowns and hidden equations.
     """
     refuse_wrong_state(system, y0)
     system, args = opened(current((with_rates(system, yd0, y0), args)))
@@ -202,7 +202,10 @@ def _nearest_of_mechanism(system: ConstrainedSystem, t: Time, y0: State, args: A
     ode = MechanicalODE.of(system, t, y0, args)
     q, v = ode.encode(y0)
     of_q, of_v = (jnp.where(mask, 0, 1).astype(q.dtype) for mask in ode.encode(masks))
-    y, fine, remains, regular = _nearest(ode, jnp.asarray(t, q.dtype), (q, v), (of_q, of_v))
+    params = ode, jnp.asarray(t, q.dtype), (q, v), (of_q, of_v)
+    # What derivatives are by is known where they are not within another program.
+    found, fine, remains, regular = _nearest(*jax.tree.map(_known, params))
+    y = jnp.split(_with_derivatives(found, params), 2)
     if not isinstance(regular, Tracer) and not bool(regular):
         raise ValueError(mass_message(np.asarray(dense_mass(ode.unchecked_mass(q))), True, "at `y0`"))
     return ode.decode(t, y), fine, remains
@@ -221,36 +224,51 @@ def _nearest_of_any(system: System, t: Time, y0: State, args: Args, masks: State
     return jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), ode.decode(t, y)), fine, remains
 
 
+def _known(x: Any) -> Any:
+    return jnp.asarray(jax.lax.stop_gradient(x)) if eqx.is_array(x) else x
+
+
 @quickly_compiled
 def _nearest(ode: MechanicalODE, t: Time, y: Phase, free: Phase) -> Any:
-    def iterate(params: PyTree) -> Any:
-        ode, _, (q0, v0), (of_q, _) = params
-        start = jnp.concatenate([q0, v0])
-        mass = of_free(dense_mass(ode.mass(q0)), of_q)
-        near = nearest_point(
-            lambda x, aim: _improved(x, aim, params),
-            start,
-            lambda x: start,
-            lambda a, b: jnp.sum(a[: q0.size] * weighted(mass, b[: q0.size])),
-            jnp.concatenate([of_q > 0, jnp.zeros_like(of_q, bool)]),
-            jnp.concatenate(
-                [weighted(mass, jnp.ones_like(q0)) if mass is None or mass.ndim < 2 else jnp.diagonal(mass), 0 * q0]
-            ),
-        )
+    params = ode, t, y, free
+    (q0, v0), (of_q, _) = y, free
+    start = jnp.concatenate([q0, v0])
+    mass = of_free(dense_mass(ode.mass(q0)), of_q)
+    near = nearest_point(
+        lambda x, aim: _improved(x, aim, params),
+        start,
+        lambda x: start,
+        lambda a, b: jnp.sum(a[: q0.size] * weighted(mass, b[: q0.size])),
+        jnp.concatenate([of_q > 0, jnp.zeros_like(of_q, bool)]),
+        jnp.concatenate(
+            [weighted(mass, jnp.ones_like(q0)) if mass is None or mass.ndim < 2 else jnp.diagonal(mass), 0 * q0]
+        ),
+    )
 
-        def correct(x: Float[Array, " 2n"]) -> Any:
-            new = _improved(x, x, params)
-            return new, relative_change(new - x, x)
+    def correct(x: Float[Array, " 2n"]) -> Any:
+        new = _improved(x, x, params)
+        return new, relative_change(new - x, x)
 
-        # What is left of the constraints at the nearest point.
-        return fixed_point(correct, near, max_steps=100)
-
-    off = lambda x, params: x - _improved(x, jnp.concatenate(params[2]), params)
-    x, _ = implicit_root(off, iterate, (ode, t, y, free))
+    # What is left of the constraints at the nearest point.
+    x, _ = fixed_point(correct, near, max_steps=100)
     q, v = jnp.split(x, 2)
-    remains, regular = violation(ode, t, (q, v)), mass_is_regular(ode, y[0], True)
+    remains, regular = violation(ode, t, (q, v)), mass_is_regular(ode, q0, True)
     found = remains.consistent() & regular
-    return jax.tree.map(lambda z: jnp.where(found, z, jnp.nan), (q, v)), found, remains, regular
+    return jnp.where(found, x, jnp.nan), found, remains, regular
+
+
+def _with_derivatives(x: Float[Array, " 2n"], params: PyTree) -> Float[Array, " 2n"]:
+    """What has been found, with its derivatives by what it was found for."""
+    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(params))
+    return _implicit(x, params) if traced else x
+
+
+@eqx.filter_jit
+def _implicit(x: Float[Array, " 2n"], params: PyTree) -> Float[Array, " 2n"]:
+    def off(x: Float[Array, " 2n"], given: PyTree) -> Float[Array, " 2n"]:
+        return x - _improved(x, jnp.concatenate(given[1][2]), given[1])
+
+    return implicit_root(off, lambda given: (given[0], None), (jax.lax.stop_gradient(x), params))[0]
 
 
 def _improved(x: Float[Array, " 2n"], aim: Float[Array, " 2n"], params: PyTree) -> Float[Array, " 2n"]:

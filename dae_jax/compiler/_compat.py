@@ -12,7 +12,7 @@ from typing import Any, ParamSpec, TypeVar
 import jax
 import numpy as np
 from jax._src import xla_bridge
-from jax._src.core import trace_state_clean as trace_state_clean
+from jax._src.core import eval_context as eval_context, trace_state_clean as trace_state_clean
 from jax.interpreters.partial_eval import dce_jaxpr as dce_jaxpr
 
 from .types import Aval, Equation, Params

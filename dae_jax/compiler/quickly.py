@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 from jax.core import Tracer
 
-from ._compat import accepted_options, trace_state_clean
+from ._compat import accepted_options, eval_context
 
 
 P = ParamSpec("P")
@@ -21,7 +21,8 @@ _QUICK = (("xla_backend_optimization_level", 0), ("xla_cpu_use_fusion_emitters",
 
 def quickly_compiled(fn: Callable[P, T]) -> Callable[P, T]:
     """`eqx.filter_jit(fn)`, on the CPU without most of XLA's optimisations: compiled in a third to a fifth of the time (the search for
-    a consistent state of a four-bar linkage in space: 2.6 s in place of 5.9). Within other programs, and of many numbers, as usual.
+    a consistent state of a four-bar linkage in space: 2.6 s in place of 5.9). Of numbers that are traced, and of many, as usual; of
+    others at once, also where others still are being traced.
     """
     usual = eqx.filter_jit(fn)
 
@@ -29,9 +30,14 @@ def quickly_compiled(fn: Callable[P, T]) -> Callable[P, T]:
     def called(*args: P.args, **kwargs: P.kwargs) -> T:
         arrays = [x for x in jax.tree.leaves((args, kwargs)) if eqx.is_array(x)]
         few = sum(x.size for x in arrays) <= FEW and not any(isinstance(x, Tracer) for x in arrays)
-        if not few or not trace_state_clean() or jax.default_backend() != "cpu":
+        if not few or jax.default_backend() != "cpu":
             return usual(*args, **kwargs)
-        return quick()(*args, **kwargs)
+        try:
+            with eval_context():
+                return quick()(*args, **kwargs)
+        except jax.errors.UnexpectedTracerError:
+            # One that a function holds.
+            return usual(*args, **kwargs)
 
     @functools.cache
     def quick() -> Any:

@@ -269,14 +269,24 @@ def of_rows(s: Float[Array, "c c"], kept: Float[Array, " c"]) -> Float[Array, "c
 def shortest(
     a: Float[Array, "c n"], mass: Float[Array, "..."] | None, free: Float[Array, " n"], b: Float[Array, " c"]
 ) -> Float[Array, " n"]:
-    """The shortest x with A x = b in the metric of the mass matrix, where entries that are not `free` stay 0."""
-    n = mass_solve(of_free(mass, free), (a * free).T)
+    """The shortest x with A x = b in the metric of the mass matrix, where entries that are not `free` stay 0; by LAPACK, as a program of
+    its own.
+    """
+    n = _by_cholesky(of_free(mass, free), (a * free).T)
     schur = jnp.dot(a, n)
     # Rows of lengths beside those of angles are not dependent because their unit is small or large.
     scale = unit_diagonal(schur)
     schur = scale[:, None] * schur * scale
     cut = float(jnp.finfo(schur.dtype).eps) ** 0.5
     return jnp.dot(n, scale * jnp.dot(jnp.linalg.pinv(schur, rtol=cut, hermitian=True), scale * b))
+
+
+def _by_cholesky(mass: Float[Array, "..."] | None, x: Float[Array, "n k"]) -> Float[Array, "n k"]:
+    """M⁻¹ x; NaN where M is not definite."""
+    if mass is None or mass.ndim < 2:
+        return mass_solve(mass, x)
+    blocks = x.reshape(*mass.shape[:-1], -1)
+    return jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(mass), True), blocks).reshape(x.shape)
 
 
 def of_free(mass: Float[Array, "..."] | None, free: Float[Array, " n"]) -> Float[Array, "..."] | None:

@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float, PyTree
 
 from ..types import IntScalar
@@ -64,18 +65,42 @@ def _by_determinant(s: Float[Array, "2 2"], b: Float[Array, "2 *k"]) -> Float[Ar
 
 def _unrolled(s: Float[Array, "m m"], b: Float[Array, "m *k"]) -> Float[Array, "m *k"]:
     m = s.shape[0]
-    lower: list[list[Array]] = [[] for _ in range(m)]  # L D, row by row
+    at_hand = lax.stop_gradient(s)
+    unit: list[list[Array]] = []  # L, row by row
     inverse: list[Array] = []  # 1 / D
-    x: list[Array] = []
     for i in range(m):
+        row: list[Array] = []  # of L D
         for j in range(i + 1):
-            lower[i].append(s[i, j] - _sum(lower[i][k] * (lower[j][k] * inverse[k]) for k in range(j)))
-        inverse.append(1 / definite_pivot(lower[i][i], s[i, i], m))
-        x.append(b[i] - _sum(lower[i][k] * x[k] for k in range(i)))
-        x[i] = x[i] * inverse[i]
+            row.append(at_hand[i, j] - _sum(row[k] * unit[j][k] for k in range(j)) if j < i else at_hand[i, i])
+        unit.append([x * inverse[k] for k, x in enumerate(row[:i])])
+        pivot = row[i] - _sum(x * y for x, y in zip(row[:i], unit[i], strict=True))
+        inverse.append(1 / definite_pivot(pivot, row[i], m))
+    return _substituted((unit, inverse), s, b) if m else b
+
+
+@jax.custom_jvp
+def _substituted(
+    factors: tuple[list[list[Array]], list[Array]],
+    s: Float[Array, "m m"],  # noqa: ARG001
+    b: Float[Array, "m *k"],
+) -> Float[Array, "m *k"]:
+    """x with S x = b, by factors of S: its derivatives are a product with those of S and one more substitution, where those of the
+    elimination would be several times the program.
+    """
+    (unit, inverse), x, m = factors, [], len(b)
+    for i in range(m):
+        x.append(b[i] - _sum(unit[i][k] * x[k] for k in range(i)))
     for i in reversed(range(m)):
-        x[i] = x[i] - _sum((lower[k][i] * inverse[i]) * x[k] for k in range(i + 1, m))
-    return jnp.stack(x) if m else b
+        x[i] = x[i] * inverse[i] - _sum(unit[k][i] * x[k] for k in range(i + 1, m))
+    return jnp.stack(x)
+
+
+@_substituted.defjvp
+def _(primals: Any, tangents: Any) -> Any:
+    (factors, s, b), (_, ds, db) = primals, tangents
+    x = _substituted(factors, s, b)
+    moved = jnp.sum(ds.reshape(*ds.shape, *[1] * (x.ndim - 1)) * x, 1)
+    return x, _substituted(factors, s, db - moved)
 
 
 def _sum(terms: Iterable[Array]):

@@ -45,6 +45,10 @@ def assembled(
     """The consistent state nearest to a guess, with these values of coordinates and rates."""
     numbers("`t0`", t0, ())
     start, at, rates = _start(mechanism, guess), _values("at", at), _values("rates", rates)
+    # What is wrong with a function is no matter of closing.
+    refuse_wrong_functions(mechanism.system(), t0, start, args)
+    # Loads neither, which derivatives may be by, while all else is known.
+    mechanism = type(mechanism)(mechanism.bodies, mechanism.joints)
     if at.keys() - rates.keys():
         # What has a value and no rate moves as the guess does, or as motors move it: places are found at rest, velocities after them.
         system, rest = _with_values(mechanism, at, {}, t0, at_rest=True), jax.tree.map(jnp.zeros_like, start[1])
@@ -71,8 +75,6 @@ def _reversed(mechanism: "Mechanism", q: Coordinates) -> dict[str, Bool[Array, "
 def _closed(
     mechanism: "Mechanism", system: ConstrainedSystem, start: tuple[Coordinates, Coordinates], t0: Time, args: Args
 ) -> tuple[Coordinates, Coordinates]:
-    # What is wrong with a function is no matter of closing.
-    refuse_wrong_functions(system, t0, start, args)
     try:
         return consistent_state(system, t0, start, args)
     except ValueError as refusal:

@@ -195,10 +195,9 @@ def mass_block(mass: Float[Array, ""], inertia: Float[Array, "..."], q: Float[Ar
     e = rates(q[3:])
     by_row = jnp.sum(inertia[:, :, None] * e[None, :, :], 1)
     turning = 4 * jnp.sum(e[:, :, None] * by_row[:, None, :], 0) + _along(inertia) * q[3:, None] * q[3:]
-    heavy = mass * jnp.eye(3)
-    return jnp.concatenate(
-        [jnp.concatenate([heavy, jnp.zeros((3, 4))], 1), jnp.concatenate([jnp.zeros((4, 3)), turning], 1)]
-    )
+    heavy = mass * np.eye(3, dtype=mass.dtype)
+    beside = np.zeros((3, 4), mass.dtype)
+    return jnp.concatenate([jnp.concatenate([heavy, beside], 1), jnp.concatenate([beside.T, turning], 1)])
 
 
 def inverse_roots(mass: Float[Array, "..."]) -> Float[Array, " n"]:
@@ -219,7 +218,7 @@ def inertial_force(inertia: Float[Array, "..."], q: Float[Array, " k"], v: Float
 
 def _along(inertia: Float[Array, "3 3"]) -> Float[Array, ""]:
     """c, of the size of the other eigenvalues of M."""
-    return 4 * jnp.trace(inertia) / 3
+    return 4 / 3 * jnp.sum(inertia * np.eye(3, dtype=inertia.dtype))
 
 
 # What bodies are joined to that are joined to the world: it does not move, and its axes are the world's.

@@ -7,7 +7,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
 
 from .bodies import Body, Ground, Pose, Twist, dimension, ground, ground_row, pose, reference_row, twist
 from .rotations import conjugate, product, rotate
@@ -46,7 +47,11 @@ class Configuration:
         below = jnp.asarray(ground_row(self.dimension), q.values.dtype)[None]
         self.rows = jnp.concatenate([q.values, below])
         self.velocities = None if v is None else jnp.concatenate([v.values, 0 * below])
-        self.poses: Pose = jax.vmap(pose)(self.rows)
+
+    @functools.cached_property
+    def poses(self) -> Pose:
+        """Where all are."""
+        return jax.vmap(pose)(self.rows)
 
     @property
     def masses(self) -> Float[Array, " bodies"]:
@@ -76,6 +81,16 @@ class Configuration:
     def table(self, name: str, row: Float[Array, " k"]) -> Float[Array, "bodies k"]:
         """Forces on all bodies of which one is not 0."""
         return jnp.asarray(np.arange(len(self.q.names)) == self.row(name), row.dtype)[:, None] * row
+
+
+def at_rows(x: Float[Array, "n *k"], rows: Int[np.ndarray, " m"]) -> Float[Array, "m *k"]:
+    """x[rows], in one equation where that is several: programs of mechanisms are full of it."""
+    first, count = int(rows[0]), len(rows)
+    if np.array_equal(rows, first + np.arange(count)):
+        return lax.slice_in_dim(x, first, first + count)
+    numbers = lax.GatherDimensionNumbers(tuple(range(1, x.ndim)), (0,), (0,))
+    places = rows[:, None].astype(np.int32)
+    return lax.gather(x, places, numbers, (1, *x.shape[1:]), mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS)
 
 
 MarkerArrays: TypeAlias = tuple[Float[Array, " d"], Float[Array, "d d"], Float[Array, "..."]]
@@ -177,8 +192,9 @@ def is_within_half_a_turn(
     """Whether b has turned in space by less than half a turn against a since the reference configuration, where their quaternions
     were these. Beyond it is false for another full turn: quaternions on the way do not jump.
     """
-    turned_a, turned_b = product(q_a[3:], conjugate(reference_a)), product(q_b[3:], conjugate(reference_b))
-    return product(conjugate(turned_a), turned_b)[0] > 0
+    # A flag has no derivatives.
+    e_a, e_b = lax.stop_gradient((q_a[3:], q_b[3:]))
+    return jnp.sum(product(e_a, conjugate(reference_a)) * product(e_b, conjugate(reference_b))) > 0
 
 
 def axis_of(dimension: int) -> int:

@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..types import Args, Time
 from .bodies import Numbers
-from .configuration import Configuration, Coordinate, Kind, Marker
+from .configuration import Configuration, Coordinate, Kind, Marker, at_rows
 from .interface import AbstractHolonomicJoint
 from .placement import (
     Part,
@@ -89,10 +89,10 @@ def pairs(joints: Sequence[Joint], at: Configuration) -> Float[Array, " m"]:
     for on in ([joint.on_a for joint in joints], [joint.on_b for joint in joints]):
         rows = np.array([at.row(marker.body) for marker in on])
         point, frame, angle = (jnp.stack(x) for x in zip(*(marker.arrays for marker in on), strict=True))
-        turn = at.poses.rotation[rows]
-        place = at.poses.position[rows] + jnp.sum(turn * point[:, None, :], 2)
+        turn = at_rows(at.poses.rotation, rows)
+        place = at_rows(at.poses.position, rows) + jnp.sum(turn * point[:, None, :], 2)
         axes = jnp.sum(turn[:, :, :, None] * frame[:, None, :, :], 2)
-        sides.append((place, axes, None if at.poses.angle is None else at.poses.angle[rows] - angle))
+        sides.append((place, axes, None if at.poses.angle is None else at_rows(at.poses.angle, rows) - angle))
     (p_a, axes_a, turned_a), (p_b, axes_b, turned_b) = sides
     apart = p_b - p_a
     along = jnp.sum(axes_a * apart[:, :, None], 1)
@@ -104,7 +104,7 @@ def pairs(joints: Sequence[Joint], at: Configuration) -> Float[Array, " m"]:
     )
     every = jnp.concatenate([apart, along, turns], 1)
     chosen = [k * every.shape[1] + i for k, joint in enumerate(joints) for i in joint.columns]
-    return jnp.ravel(every)[np.array(chosen)]
+    return at_rows(jnp.ravel(every), np.array(chosen))
 
 
 def revolute(

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from ..types import Args, Scalar, Time
 from ..validate.states import brief
 from .bodies import Body, Numbers, generalised, numbers, pose
-from .configuration import Configuration, Coordinate, MarkerArrays, is_within_half_a_turn, value
+from .configuration import Configuration, Coordinate, MarkerArrays, at_rows, is_within_half_a_turn, value
 from .contacts import Motion
 from .interface import AbstractJoint, only_coordinate
 from .laws import HALF_TURN, Drive, Friction, Law, Spring
@@ -94,11 +94,11 @@ def along(loads: Sequence[Along], t: Time, at: Configuration, args: Args) -> Flo
         slope = jax.grad(c)(q)
         return c(q), jnp.sum(slope[0] * v[0]) + jnp.sum(slope[1] * v[1]), slope
 
-    u, q = at.velocities, at.rows
-    c, rate, slopes = jax.vmap(one)((q[a], q[b]), (u[a], u[b]), (on_a, on_b))
+    q, v = ((at_rows(x, a), at_rows(x, b)) for x in (at.rows, at.velocities))
+    c, rate, slopes = jax.vmap(one)(q, v, (on_a, on_b))
     counts = np.array([load.counts_turns for load in loads])
     if counts.any():
-        c = jnp.where(jax.vmap(is_within_half_a_turn)(q[a], q[b], on_a[2], on_b[2]) | ~counts, c, jnp.nan)
+        c = jnp.where(jax.vmap(is_within_half_a_turn)(*q, on_a[2], on_b[2]) | ~counts, c, jnp.nan)
     efforts = jnp.stack([load.law.effort(t, c[k], rate[k], args) for k, load in enumerate(loads)])
     total = jnp.zeros_like(at.q.values)
     for rows, slope in zip((a, b), slopes, strict=True):

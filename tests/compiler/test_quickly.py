@@ -31,6 +31,24 @@ def test_within_other_programs_it_is_a_part_of_these():
     np.testing.assert_allclose(jax.jit(lambda: fn(X))(), fn(X), rtol=1e-14)
 
 
+def test_beside_what_is_traced_numbers_that_are_known_stay_so():
+    fn, seen = quickly_compiled(lambda x: jnp.sum(x**3)), []
+    fn(X)
+
+    def traced(k):
+        seen.append(fn(X))
+        return k * seen[-1]
+
+    for derivative in (jax.grad(traced), jax.jit(traced)):
+        np.testing.assert_allclose(derivative(1.0), fn(X), rtol=1e-14)
+    assert not any(isinstance(x, jax.core.Tracer) for x in seen)
+
+
+def test_a_function_may_hold_what_is_traced():
+    of = quickly_compiled(lambda fn, x: fn(x))
+    np.testing.assert_allclose(jax.grad(lambda k: of(lambda x: jnp.sum(k**2 * x), X))(2.0), 4 * jnp.sum(X), rtol=1e-14)
+
+
 @pytest.fixture
 def options_of(monkeypatch):
     """The options of XLA with which each program is compiled."""

@@ -42,7 +42,8 @@ def test_at_each_step(method):
 
     (t, _, v), (_, dq, _) = jax.jvp(steps, (FIELD,), (1.0,))
     reached = np.isfinite(t)
-    assert reached.sum() > 80
+    # Steps of derivatives may be shorter than those of the solution, and are not longer.
+    assert reached.sum() >= np.isfinite(solve(FIELD, method, diffrax.SaveAt(steps=True)).ts).sum() > 20
     np.testing.assert_allclose(dq[reached], slope(t[reached], v[reached]), atol=3e-8)
 
 

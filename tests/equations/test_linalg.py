@@ -9,6 +9,7 @@ import optimistix
 import pytest
 
 from dae_jax.compiler import hindrances
+from dae_jax.compiler.jaxprs.walk import equations
 from dae_jax.linalg import (
     SmallCholesky,
     SmallLU,
@@ -64,6 +65,28 @@ class TestSemidefiniteSolve:
         x = semidefinite_solve(S, b)
         assert x.dtype == jnp.float32
         np.testing.assert_allclose(S @ x, b, rtol=1e-5, atol=1e-5)
+
+    @pytest.mark.parametrize("columns", [(), (3,)], ids=["vector", "matrix"])
+    @pytest.mark.parametrize("m", [2, *range(4, UNROLLED + 2)])
+    def test_derivatives_are_those_of_numpy(self, m, columns):
+        """The first along a change of S and b, and the second; S x = b gives S x′ = b′ − S′ x and S x″ = b″ − 2 S′ x′ − S″ x."""
+        S, b, dS, db = definite(m), right(m, *columns), definite(m, 2), right(m, *columns, seed=3)
+        x = np.linalg.solve(S, b)
+        first = np.linalg.solve(S, db - dS @ x)
+        second = np.linalg.solve(S, -2 * dS @ first)
+        along = lambda fn: lambda h: jax.jvp(fn, (h,), (1.0,))[1]
+        moved = lambda h: semidefinite_solve(S + h * dS, b + h * db)
+        np.testing.assert_allclose(along(moved)(0.0), first, rtol=1e-10, atol=1e-13)
+        np.testing.assert_allclose(along(along(moved))(0.0), second, rtol=1e-10, atol=1e-13)
+        np.testing.assert_allclose(
+            jax.grad(lambda h: jnp.sum(moved(h) * x))(0.0), np.sum(first * x), rtol=1e-10, atol=1e-13
+        )
+
+    def test_derivatives_eliminate_nothing_anew(self):
+        """They take another substitution: the program of a derivative is not several times that of the solution."""
+        S, b = definite(UNROLLED), right(UNROLLED)
+        size = lambda fn: len(equations(jax.make_jaxpr(fn)(S, b)))
+        assert size(lambda S, b: jax.jvp(semidefinite_solve, (S, b), (S, b))) < 2 * size(semidefinite_solve)
 
     @pytest.mark.parametrize("m", [2, UNROLLED, UNROLLED + 2, LOOPED])
     def test_singular_without_rank_is_nan(self, m):

@@ -87,6 +87,19 @@ class TestCompiler:
         assert seen[0] == pytest.approx(np.sin(1.0))
         assert "iota" in seen
 
+    def test_outside_of_what_is_traced(self):
+        """A program that is called there has its own options, and what a function holds of what is traced is refused."""
+        twice = jax.jit(lambda x: 2 * x, compiler_options={"xla_backend_optimization_level": 0})
+
+        def traced(x):
+            with of_compiler.eval_context():
+                known = float(twice(jnp.asarray(1.5)))
+                with pytest.raises(jax.errors.UnexpectedTracerError):
+                    jax.jit(lambda y: x * y)(known)
+            return known * x
+
+        assert jax.grad(traced)(1.0) == jax.jit(traced)(1.0) == 3.0
+
     def test_jax_has_started(self):
         jnp.zeros(1).block_until_ready()
         assert of_compiler.backends_are_initialised()

@@ -3,11 +3,12 @@
 import diffrax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.special import ellipj
 
 import dae_jax
 from dae_jax import mechanisms as m
-from dae_jax.mechanisms.rotations import matrix, rates
+from dae_jax.mechanisms.rotations import matrix, product, rates
 
 
 TIGHT = diffrax.PIDController(rtol=1e-13, atol=1e-13)
@@ -74,3 +75,18 @@ def test_a_heavy_symmetric_top_keeps_what_it_must():
     assert np.abs(force[5:-5, 2] - 2.0 * (9.81 + speed[5:-5])).max() < 2.0
     assert np.abs(moment).max() < 1e-8
     assert np.asarray(dae_jax.drift(mechanism.system(), sol).position).max() < 1e-12
+
+
+def test_rotations_are_those_of_scipy():
+    rng = np.random.default_rng(0)
+    a, b = (x / np.linalg.norm(x) for x in rng.normal(size=(2, 4)))
+    of = lambda e: Rotation.from_quat(np.roll(np.asarray(e), -1))
+    np.testing.assert_allclose(matrix(jnp.asarray(a)), of(a).as_matrix(), atol=1e-15)
+    np.testing.assert_allclose(matrix(product(jnp.asarray(a), jnp.asarray(b))), (of(a) * of(b)).as_matrix(), atol=1e-15)
+    # A turn at the angular velocity ω in body axes.
+    omega, h = rng.normal(size=3), 1e-6
+    ahead, behind = (np.roll((of(a) * Rotation.from_rotvec(x * omega)).as_quat(), 1) for x in (h, -h))
+    de = (np.sign(ahead @ a) * ahead - np.sign(behind @ a) * behind) / (2 * h)
+    np.testing.assert_allclose(2 * rates(jnp.asarray(a)) @ de, omega, atol=1e-9)
+    single = jnp.asarray(a, jnp.float32)
+    assert matrix(single).dtype == rates(single).dtype == product(single, single).dtype == jnp.float32

@@ -170,3 +170,16 @@ def test_a_solution_without_states_is_refused(saveat, said):
     ):
         with pytest.raises(ValueError, match=said):
             show()
+
+
+def test_what_loads_are_does_not_matter_to_closing():
+    """By a stiffness everything that is assembled stays known, so that it is not compiled once more for a derivative."""
+    seen = []
+
+    def assembled(stiffness):
+        mechanism = m.Mechanism(BODIES, JOINTS, [m.spring(JOINTS[0], stiffness)])
+        seen.append(mechanism.assemble(at={"h": 0.3, "k": -0.2})[0].values)
+        return jnp.sum(seen[-1]) + stiffness
+
+    assert jax.grad(assembled)(3.0) == 1.0
+    np.testing.assert_array_equal(seen[0], ONE.assemble(at={"h": 0.3, "k": -0.2})[0].values)
