@@ -170,8 +170,8 @@ def consistent_state(
       whose derivative occurs in the equations. All entries of the state then count alike for mechanisms also.
     - `yd0`: near which ẏ is looked for, for an `ImplicitDAE` that is nonlinear in it.
 
-    Errors: `ValueError` where no such state is found from here, naming the equations that remain off; NaN within `jit` and
-    `vmap`; `NotImplementedError` for its derivative where it has more than 256 unknowns and hidden equations.
+    Errors: `ValueError` where no such state is found from here, naming the equations that remain off; NaN where the
+    arguments are traced, of a mechanism within `jit` and `vmap` only; `NotImplementedError` for its derivative where it has more than 256 unknowns and hidden equations.
     """
     refuse_wrong_state(system, y0)
     system, args = opened(current((with_rates(system, yd0, y0), args)))
@@ -204,11 +204,12 @@ def _nearest_of_mechanism(system: ConstrainedSystem, t: Time, y0: State, args: A
     of_q, of_v = (jnp.where(mask, 0, 1).astype(q.dtype) for mask in ode.encode(masks))
     params = ode, jnp.asarray(t, q.dtype), (q, v), (of_q, of_v)
     # What derivatives are by is known where they are not within another program.
-    found, fine, remains, regular = _nearest(*jax.tree.map(_known, params))
-    y = jnp.split(_with_derivatives(found, params), 2)
+    ode, t, y, free = jax.tree.map(_known, params)
+    found, fine, remains, regular = _nearest(ode, t, y, free)
     if not isinstance(regular, Tracer) and not bool(regular):
-        raise ValueError(mass_message(np.asarray(dense_mass(ode.unchecked_mass(q))), True, "at `y0`"))
-    return ode.decode(t, y), fine, remains
+        raise ValueError(mass_message(np.asarray(dense_mass(ode.unchecked_mass(y[0]))), True, "at `y0`"))
+    q, v = jnp.split(_with_derivatives(found, params), 2)
+    return ode.decode(t, (q, v)), fine, remains
 
 
 @quickly_compiled

@@ -142,3 +142,20 @@ def test_consistent_starts_stay_where_rates_are_nonlinear(residual, y):
     np.testing.assert_allclose(
         dae_jax.consistent_state(dae_jax.ImplicitDAE(residual), 0.0, jnp.array(y)), y, rtol=1e-14
     )
+
+
+def on_a_circle(radius):
+    return dae_jax.ConstrainedSystem(lambda t, q, v, args: -q, lambda t, q, args: q @ q - radius * jnp.abs(radius))
+
+
+def test_within_a_derivative_what_is_wrong_is_said():
+    """There numbers are known, as they are not where they are compiled for or batched."""
+    y0 = jnp.array([1.0, 0.2]), jnp.array([0.1, 1.0])
+    place = lambda radius: dae_jax.consistent_state(on_a_circle(radius), 0.0, y0)[0]
+    np.testing.assert_allclose(jax.jacfwd(place)(1.3), place(1.0), rtol=1e-12)
+    np.testing.assert_allclose(jax.jacrev(place)(1.3), place(1.0), rtol=1e-12)
+    with pytest.raises(
+        ValueError, match=r"No consistent state was found near `y0`(.|\n)*constraint\[0\] \(g\) is off by 2"
+    ):
+        jax.jacfwd(place)(-1.0)
+    assert np.isnan(jax.jit(jax.jacfwd(place))(-1.0)).all()
