@@ -170,8 +170,9 @@ def consistent_state(
       whose derivative occurs in the equations. All entries of the state then count alike for mechanisms also.
     - `yd0`: near which ẏ is looked for, for an `ImplicitDAE` that is nonlinear in it.
 
-    Errors: `ValueError` where no such state is found from here, naming the equations that remain off; NaN where the
-    arguments are traced, of a mechanism within `jit` and `vmap` only; `NotImplementedError` for its derivative where it has more than 256 unknowns and hidden equations.
+    Errors: `ValueError` where no such state is found from here, naming the equations that remain off; NaN where the arguments are
+    traced, of a mechanism within `jit` and `vmap` only; `NotImplementedError` for its derivative where it has more than 256
+    unknowns and hidden equations.
     """
     refuse_wrong_state(system, y0)
     system, args = opened(current((with_rates(system, yd0, y0), args)))
