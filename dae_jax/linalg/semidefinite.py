@@ -66,32 +66,34 @@ def _by_determinant(s: Float[Array, "2 2"], b: Float[Array, "2 *k"]) -> Float[Ar
 def _unrolled(s: Float[Array, "m m"], b: Float[Array, "m *k"]) -> Float[Array, "m *k"]:
     m = s.shape[0]
     at_hand = lax.stop_gradient(s)
-    unit: list[list[Array]] = []  # L, row by row
+    lower: list[list[Array]] = []  # L D, row by row
+    unit: list[list[Array]] = []  # L
     inverse: list[Array] = []  # 1 / D
     for i in range(m):
-        row: list[Array] = []  # of L D
-        for j in range(i + 1):
-            row.append(at_hand[i, j] - _sum(row[k] * unit[j][k] for k in range(j)) if j < i else at_hand[i, i])
-        unit.append([x * inverse[k] for k, x in enumerate(row[:i])])
-        pivot = row[i] - _sum(x * y for x, y in zip(row[:i], unit[i], strict=True))
-        inverse.append(1 / definite_pivot(pivot, row[i], m))
-    return _substituted((unit, inverse), s, b) if m else b
+        row: list[Array] = []
+        for j in range(i):
+            row.append(at_hand[i, j] - _sum(row[k] * unit[j][k] for k in range(j)))
+        lower.append(row)
+        unit.append([x * inverse[k] for k, x in enumerate(row)])
+        pivot = at_hand[i, i] - _sum(x * y for x, y in zip(row, unit[i], strict=True))
+        inverse.append(1 / definite_pivot(pivot, at_hand[i, i], m))
+    return _substituted((lower, unit, inverse), s, b) if m else b
 
 
 @jax.custom_jvp
 def _substituted(
-    factors: tuple[list[list[Array]], list[Array]],
+    factors: tuple[list[list[Array]], list[list[Array]], list[Array]],
     s: Float[Array, "m m"],  # noqa: ARG001
     b: Float[Array, "m *k"],
 ) -> Float[Array, "m *k"]:
     """x with S x = b, by factors of S: its derivatives are a product with those of S and one more substitution, where those of the
     elimination would be several times the program.
     """
-    (unit, inverse), x, m = factors, [], len(b)
+    (lower, unit, inverse), x, m = factors, [], len(b)
     for i in range(m):
-        x.append(b[i] - _sum(unit[i][k] * x[k] for k in range(i)))
+        x.append((b[i] - _sum(lower[i][k] * x[k] for k in range(i))) * inverse[i])
     for i in reversed(range(m)):
-        x[i] = x[i] * inverse[i] - _sum(unit[k][i] * x[k] for k in range(i + 1, m))
+        x[i] = x[i] - _sum(unit[k][i] * x[k] for k in range(i + 1, m))
     return jnp.stack(x)
 
 
