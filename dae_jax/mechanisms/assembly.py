@@ -47,14 +47,18 @@ def assembled(
     start, at, rates = _start(mechanism, guess), _values("at", at), _values("rates", rates)
     # What is wrong with a function is no matter of closing.
     refuse_wrong_functions(mechanism.system(), t0, start, args)
+    coordinates = {name: coordinate_named(mechanism, name) for name in (*at, *rates)}
     # Loads neither, which derivatives may be by, while all else is known.
     mechanism = type(mechanism)(mechanism.bodies, mechanism.joints)
     if at.keys() - rates.keys():
         # What has a value and no rate moves as the guess does, or as motors move it: places are found at rest, velocities after them.
-        system, rest = _with_values(mechanism, at, {}, t0, at_rest=True), jax.tree.map(jnp.zeros_like, start[1])
+        system, rest = (
+            _with_values(mechanism, coordinates, at, {}, t0, at_rest=True),
+            jax.tree.map(jnp.zeros_like, start[1]),
+        )
         start = (_closed(mechanism, system, (start[0], rest), t0, args)[0], start[1])
         at = {name: at[name] for name in at.keys() & rates.keys()}
-    found = _closed(mechanism, _with_values(mechanism, at, rates, t0), start, t0, args)
+    found = _closed(mechanism, _with_values(mechanism, coordinates, at, rates, t0), start, t0, args)
     if not isinstance(found[0].values, Tracer):
         for name, is_reversed in _reversed(mechanism, found[0]).items():
             if is_reversed:
@@ -158,20 +162,18 @@ def _on_its_side(mechanism: "Mechanism", q: Coordinates, chosen: set[str]) -> Co
 
 
 def _with_values(
-    mechanism: "Mechanism", at: dict[str, Array], rates: dict[str, Array], t0: Time, at_rest: bool = False
+    mechanism: "Mechanism",
+    coordinates: dict[str, Coordinate],
+    at: dict[str, Array],
+    rates: dict[str, Array],
+    t0: Time,
+    at_rest: bool = False,
 ) -> ConstrainedSystem:
     """The mechanism's equations and those that fix values of coordinates and rates; `at_rest`, those of places in time's standstill."""
     system = mechanism.system()
     if not at and not rates:
         return system
-    held = _Held(
-        mechanism,
-        {name: coordinate_named(mechanism, name) for name in (*at, *rates)},
-        at,
-        rates,
-        jnp.asarray(t0),
-        at_rest,
-    )
+    held = _Held(mechanism, coordinates, at, rates, jnp.asarray(t0), at_rest)
     has_rates = not at_rest and (system.nonholonomic is not None or set(rates) - set(at))
     has_positions = system.constraint is not None or at
     return ConstrainedSystem(

@@ -183,3 +183,12 @@ def test_what_loads_are_does_not_matter_to_closing():
 
     assert jax.grad(assembled)(3.0) == 1.0
     np.testing.assert_array_equal(seen[0], ONE.assemble(at={"h": 0.3, "k": -0.2})[0].values)
+
+
+def test_what_a_load_acts_along_may_have_a_value():
+    between = m.between(m.ground, BODIES[1], ((0.0, 1.0), (1.5, 0.0)))
+    for load in (m.spring(between, 3.0, name="s"), m.damper(between, 0.1, name="s")):
+        q, v = m.Mechanism(BODIES, JOINTS, [load]).assemble(at={"s": 1.5}, rates={"s": 0.4})
+        place, speed = np.asarray(q["heavy"][:2]) - (0, 1), np.asarray(v["heavy"][:2])
+        np.testing.assert_allclose(np.linalg.norm(place), 1.5, rtol=1e-12)
+        np.testing.assert_allclose(place @ speed / 1.5, 0.4, rtol=1e-12)
