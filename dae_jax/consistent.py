@@ -13,6 +13,7 @@ from .compiler import at_ease, quickly_compiled
 from .equations.constraint_jacobian import dense_mass, of_free, shortest
 from .equations.initial_rates import is_nonlinear, rates_of
 from .equations.linearised import LinearisedResidual
+from .equations.manifold_ode import constant
 from .equations.mechanical import MechanicalODE
 from .equations.nearest_point import nearest_point
 from .equations.regularity import ALONG, mass_is_regular, mass_message
@@ -205,7 +206,7 @@ def _nearest_of_mechanism(system: ConstrainedSystem, t: Time, y0: State, args: A
     of_q, of_v = (jnp.where(mask, 0, 1).astype(q.dtype) for mask in ode.encode(masks))
     params = ode, jnp.asarray(t, q.dtype), (q, v), (of_q, of_v)
     # What derivatives are by is known where they are not within another program.
-    ode, t, y, free = jax.tree.map(_known, params)
+    ode, t, y, free = constant(params)
     found, fine, remains, regular = _nearest(ode, t, y, free)
     if not isinstance(regular, Tracer) and not bool(regular):
         raise ValueError(mass_message(np.asarray(dense_mass(ode.unchecked_mass(y[0]))), True, "at `y0`"))
@@ -224,10 +225,6 @@ def _nearest_of_any(system: System, t: Time, y0: State, args: Args, masks: State
     remains = _left_over(ode, t, y, values, jnp.zeros_like(t))
     fine = remains.consistent()
     return jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), ode.decode(t, y)), fine, remains
-
-
-def _known(x: Any) -> Any:
-    return jnp.asarray(jax.lax.stop_gradient(x)) if eqx.is_array(x) else x
 
 
 @quickly_compiled
@@ -270,7 +267,7 @@ def _implicit(x: Float[Array, " 2n"], params: PyTree) -> Float[Array, " 2n"]:
     def off(x: Float[Array, " 2n"], given: PyTree) -> Float[Array, " 2n"]:
         return x - _improved(x, jnp.concatenate(given[1][2]), given[1])
 
-    return implicit_root(off, lambda given: (given[0], None), (jax.lax.stop_gradient(x), params))[0]
+    return implicit_root(off, lambda given: (given[0], None), (x, params))[0]
 
 
 def _improved(x: Float[Array, " 2n"], aim: Float[Array, " 2n"], params: PyTree) -> Float[Array, " 2n"]:

@@ -267,8 +267,8 @@ def _filled_in(solver: Any, controller: diffrax.AbstractStepSizeController, adjo
         open_ones = [name for name in ("rtol", "atol", "norm") if getattr(finder, name, None) is use_stepsize_tol]
         changed["root_finder"] = dataclasses.replace(finder, **{name: getattr(controller, name) for name in open_ones})
     if getattr(solver, "scan_kind", "") is None:
-        kinds = {"lax": diffrax.ForwardMode, "bounded": diffrax.DirectAdjoint}
-        changed["scan_kind"] = next((loops for loops, kind in kinds.items() if isinstance(adjoint, kind)), None)
+        direct = "bounded" if isinstance(adjoint, diffrax.DirectAdjoint) else None
+        changed["scan_kind"] = "lax" if isinstance(adjoint, diffrax.ForwardMode) else direct
     return dataclasses.replace(solver, **changed)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..linalg import Elimination, Factors, SparseDefinite, elimination, factorised, semidefinite_solve, solve_with, take
-from ..linalg.semidefinite import LOOPED, UNROLLED
+from ..linalg.semidefinite import LOOPED, UNROLLED, by_lapack
 from ..structure import column_colouring, dependence, seed_matrix
 from ..types import Flat, Time
 from .manifold_ode import Normals, traced_once
@@ -242,15 +242,17 @@ def _unweighted(mass: Float[Array, "b k k"], seeds: Float[Array, "colours n"]) -
     return jnp.moveaxis(solved, -1, 0).reshape(seeds.shape)
 
 
-def mass_solve(mass: Float[Array, "..."] | None, x: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
-    """M⁻¹ x for M as `ConstrainedSystem.mass_matrix` gives it."""
+def mass_solve(
+    mass: Float[Array, "..."] | None, x: Float[Array, "n *k"], solved: Callable[..., Array] = semidefinite_solve
+) -> Float[Array, "n *k"]:
+    """M⁻¹ x for M as `ConstrainedSystem.mass_matrix` gives it; `solved`: how a matrix is."""
     if mass is None:
         return x
     if mass.ndim < 2:
         return x / (mass[:, None] if mass.ndim and x.ndim == 2 else mass)
     if mass.ndim == 3:
-        return jax.vmap(semidefinite_solve)(mass, x.reshape(*mass.shape[:2], *x.shape[1:])).reshape(x.shape)
-    return semidefinite_solve(mass, x)
+        return jax.vmap(solved)(mass, x.reshape(*mass.shape[:2], *x.shape[1:])).reshape(x.shape)
+    return solved(mass, x)
 
 
 def dense_mass(mass: Float[Array, "..."] | None) -> Float[Array, "..."] | None:
@@ -272,21 +274,13 @@ def shortest(
     """The shortest x with A x = b in the metric of the mass matrix, where entries that are not `free` stay 0; by LAPACK, as a program of
     its own.
     """
-    n = _by_cholesky(of_free(mass, free), (a * free).T)
+    n = mass_solve(of_free(mass, free), (a * free).T, by_lapack)
     schur = jnp.dot(a, n)
     # Rows of lengths beside those of angles are not dependent because their unit is small or large.
     scale = unit_diagonal(schur)
     schur = scale[:, None] * schur * scale
     cut = float(jnp.finfo(schur.dtype).eps) ** 0.5
     return jnp.dot(n, scale * jnp.dot(jnp.linalg.pinv(schur, rtol=cut, hermitian=True), scale * b))
-
-
-def _by_cholesky(mass: Float[Array, "..."] | None, x: Float[Array, "n k"]) -> Float[Array, "n k"]:
-    """M⁻¹ x; NaN where M is not definite."""
-    if mass is None or mass.ndim < 2:
-        return mass_solve(mass, x)
-    blocks = x.reshape(*mass.shape[:-1], -1)
-    return jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(mass), True), blocks).reshape(x.shape)
 
 
 def of_free(mass: Float[Array, "..."] | None, free: Float[Array, " n"]) -> Float[Array, "..."] | None:

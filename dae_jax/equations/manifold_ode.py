@@ -11,6 +11,7 @@ from typing import Any, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
@@ -27,7 +28,8 @@ Feedback: TypeAlias = Callable[..., Array]
 
 def constant(tree: Any) -> Any:
     """A pytree whose arrays have no derivative."""
-    return jax.tree.map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
+    # Of what is differentiated by as a number of Python's, JAX gives that number.
+    return jax.tree.map(lambda x: jnp.asarray(lax.stop_gradient(x)) if eqx.is_array(x) else x, tree)
 
 
 @runtime_checkable

@@ -34,11 +34,15 @@ def semidefinite_solve(
     if rank is not None and rank < m:
         return jnp.dot(_pseudo_inverse(s, rank), b)
     if m > LOOPED:
-        factor = jax.scipy.linalg.cho_factor(s, lower=True)
-        return jax.scipy.linalg.cho_solve(factor, b)
+        return by_lapack(s, b)
     if m > UNROLLED:
         return solve_with(factorised(s), s, b)
     return _by_determinant(s, b) if m == 2 else _unrolled(s, b)
+
+
+def by_lapack(s: Float[Array, "m m"], b: Float[Array, "m *k"]) -> Float[Array, "m *k"]:
+    """The same of definite S, of any size a short program; NaN where S is not definite."""
+    return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(s, lower=True), b)
 
 
 def smallest_pivot(s: Float[Array, "m m"]) -> Float[Array, ""]:

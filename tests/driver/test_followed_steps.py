@@ -43,7 +43,7 @@ def test_at_each_step(method):
     (t, _, v), (_, dq, _) = jax.jvp(steps, (FIELD,), (1.0,))
     reached = np.isfinite(t)
     # Steps of derivatives may be shorter than those of the solution, and are not longer.
-    assert reached.sum() >= np.isfinite(solve(FIELD, method, diffrax.SaveAt(steps=True)).ts).sum() > 20
+    assert reached.sum() >= np.isfinite(solve(FIELD, method, diffrax.SaveAt(steps=True)).ts).sum() >= 80
     np.testing.assert_allclose(dq[reached], slope(t[reached], v[reached]), atol=3e-8)
 
 
