@@ -31,6 +31,8 @@ def semidefinite_solve(
     In the semidefinite case the `rank` largest eigenvalues are kept, by LAPACK; NaN where one of them is round-off.
     """
     m = s.shape[0]
+    if rank == 0:
+        return jnp.zeros_like(b)
     if rank is not None and rank < m:
         return jnp.dot(_pseudo_inverse(s, rank), b)
     if m > LOOPED:
@@ -120,9 +122,8 @@ def _pseudo_inverse(s: Float[Array, "m m"], rank: int) -> Float[Array, "m m"]:
     none where eigenvalues are equal, are not in them.
     """
     values, vectors = jnp.linalg.eigh(s)
-    if rank:
-        least = 8 * s.shape[0] * float(jnp.finfo(s.dtype).eps) * values[-1]
-        values = jnp.where(values[s.shape[0] - rank] > least, values, jnp.nan)
+    least = 8 * s.shape[0] * float(jnp.finfo(s.dtype).eps) * values[-1]
+    values = jnp.where(values[s.shape[0] - rank] > least, values, jnp.nan)
     values, vectors = values[s.shape[0] - rank :], vectors[:, s.shape[0] - rank :]
     return jnp.dot(vectors / values, vectors.T)
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from dae_jax import compiler
+from dae_jax.compiler.jaxprs.equal_functions import EqualFunctions
 from dae_jax.compiler.lower import compiled, written
 from dae_jax.compiler.lower.repeated import repeated
 from dae_jax.compiler.thresholds import THRESHOLDS
@@ -106,6 +107,41 @@ def test_only_what_is_called_again_and_is_large(monkeypatch):
     assert len(repeated(jax.make_jaxpr(lambda x: several(x, x, C, 1))(X))) == 1
     monkeypatch.setattr("dae_jax.compiler.lower.repeated.THRESHOLDS", dataclasses.replace(THRESHOLDS, procedure=10**6))
     assert not repeated(jaxpr)
+
+
+def functions_of(*fns):
+    """How many different functions are called by one that calls them all."""
+    call_all = lambda x, y: [jax.jit(fn)(x, y) for fn in fns]
+    found = EqualFunctions()(jax.make_jaxpr(call_all)(X, X + 1))
+    calls = [eqn for eqn in found.jaxpr.eqns if eqn.primitive.name == "closed_call"]
+    assert len(calls) == len(fns)
+    for a, b in zip(jax.core.eval_jaxpr(found.jaxpr, found.consts, X, X + 1), call_all(X, X + 1), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-13)
+    return len({id(eqn.params["call_jaxpr"]) for eqn in calls})
+
+
+def test_equal_functions_are_one():
+    """But for their names, the order of arguments and equations, what is not used, and constants with the same numbers."""
+    less, more = (lambda x, y: jnp.sin(x) - jnp.cos(y)), (lambda x, y: jnp.sin(y) - jnp.cos(x))
+
+    def other_order(x, y):
+        z, _unused = jnp.cos(y), jnp.exp(x)
+        return jnp.sin(x) - z
+
+    assert functions_of(less, more, other_order) == 1
+    constant = lambda a: lambda x, y: jax.jit(lambda x: x @ np.array(a))(y) + x
+    assert functions_of(constant(A), constant(A + 0), constant(A.copy())) == 1
+    looped = lambda n: lambda x, y: jax.lax.fori_loop(0, n, lambda i, z: jnp.sin(z) + y, x)
+    assert functions_of(looped(4), looped(4), looped(5)) == 2
+
+
+def test_what_differs_is_not_one():
+    assert functions_of(lambda x, y: x * 0.0, lambda x, y: x * -0.0) == 2
+    assert functions_of(lambda x, y: x - x.sum() + y, lambda x, y: y - x.sum() + x) == 2
+    assert functions_of(lambda x, y: x + jnp.ones(6), lambda x, y: x + jnp.ones(6, int)) == 2
+    assert functions_of(lambda x, y: jnp.flip(x + y), lambda x, y: jnp.roll(x + y, 1)) == 2
+    constant = lambda a: lambda x, y: x @ np.array(a)
+    assert functions_of(constant(A), constant(A + 1e-16), constant(-A)) == 3
 
 
 @pytest.mark.parametrize("part", range(2))

@@ -5,14 +5,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Primitive, Var, jaxpr_as_fun
 from jaxtyping import Array
 
 from ..types import Atom, Aval, Equation, Params, aval_of
 from .few_turns import written_out
 from .special_functions import SPECIAL, by_simpler_ones
-from .walk import called, identity, needed_for, of_solve
+from .walk import atom_key, called, identity, needed_for, of_solve
 
 
 # They give their first operand, or what is said here; others of equinox mean something to transformations only.
@@ -100,7 +99,7 @@ class _Flat:
             return self.run(turns, args)
         if name in _SAME_IF_SO_SHAPED and _like(aval_of(args[0]), aval_of(eqn.outvars[0])):
             return args[:1]
-        atoms = [_atom(x) for x in args]
+        atoms = list(map(atom_key, args))
         key = (name, _key(eqn.params), frozenset(atoms) if name in _COMMUTATIVE else tuple(atoms))
         found = None if eqn.effects or key[1] is None else self._known.get(key)
         if found is None:
@@ -146,11 +145,6 @@ def _key(params: Params) -> Hashable:
     except TypeError:
         return None
     return key
-
-
-def _atom(x: Atom) -> Hashable:
-    # By its bits: 0 and −0 are equal, and not the same; its text has eight digits.
-    return (np.asarray(x.val).tobytes(), aval_of(x).dtype) if isinstance(x, Literal) else x
 
 
 def _meaning(eqn: Equation) -> ClosedJaxpr:

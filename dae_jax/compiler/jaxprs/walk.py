@@ -7,10 +7,10 @@ from typing import Any, TypeVar
 
 import jax
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Var
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Var
 from jaxtyping import PyTree
 
-from ..types import Equation, Params
+from ..types import Atom, Equation, Params, aval_of
 
 
 T = TypeVar("T")
@@ -109,6 +109,12 @@ def called(eqn: Equation, calls: Mapping[str, str] = ALL_CALLS) -> ClosedJaxpr |
 def identity(closed: ClosedJaxpr) -> Hashable:
     """What is the same of two calls of one function."""
     return id(closed.jaxpr), *map(id, closed.consts)
+
+
+def atom_key(x: Atom) -> Hashable:
+    """What is the same of a variable, or of a constant in its place, wherever it stands."""
+    # By its bits: 0 and −0 are equal, and not the same; its text has eight digits.
+    return (np.asarray(x.val).tobytes(), aval_of(x).dtype) if isinstance(x, Literal) else x
 
 
 def needed_for(outputs: Iterable[Any], eqns: Sequence[Any]) -> tuple[list[Any], set[Any]]:

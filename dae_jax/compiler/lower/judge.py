@@ -9,6 +9,7 @@ from jax.extend.core import ClosedJaxpr
 
 from ..emit import available
 from ..emit.target import Target, host
+from ..jaxprs.equal_functions import EqualFunctions
 from ..jaxprs.inline import Inlining
 from ..jaxprs.random_keys import without_keys
 from ..jaxprs.scalar_interpreter import Unsupported
@@ -49,7 +50,7 @@ def unsupported(
 
 @functools.lru_cache(maxsize=4)
 def _annotated(jaxpr: ClosedJaxpr, batched: tuple[bool, ...], target: Target) -> Annotated | Unsupported:
-    whole = without_keys(jaxpr)
+    whole = EqualFunctions()(without_keys(jaxpr))
     inlined = Inlining(frozenset() if target.threads else repeated(whole))
     found = next(_unsupported(inlined(whole), inlined, target), None)
     return found or _unless_too_large(estimate.annotated(inlined(whole), batched, inlined, target))

@@ -79,11 +79,18 @@ def _in_vmap(fn: Any, k: Any, xs: Any) -> Any:
 
 
 def called_twice(program: "Program") -> "Program":
-    """The same, and the same of operands in another order, by one function."""
+    """The same, and the same of operands in another order, by one function; and by one that is equal to it, with its arguments in another
+    order, one that is handed through, and results that are there twice.
+    """
     call = jax.jit(lambda *xs: tuple(program.fn(*xs)))
 
+    @jax.jit
+    def equal(k: Any, *xs: Any) -> Any:
+        found = tuple(program.fn(*xs, k))
+        return found, k, found
+
     def fn(*xs: Any) -> list[Any]:
-        return [*call(*xs), *call(*map(_turned, xs[:-1]), xs[-1])]
+        return [*call(*xs), *call(*map(_turned, xs[:-1]), xs[-1]), *jax.tree.leaves(equal(xs[-1], *xs[:-1]))]
 
     return dataclasses.replace(program, name=f"{program.name} twice", fn=fn)
 
