@@ -35,6 +35,7 @@ class _Argument:
 
     - `known`: its numbers, where these are known; `place`: that of the kernel's argument that it is, from 0 on, or −1.
     - `lanes`: whether it differs from lane to lane; `view`: an array in memory, whose kind of buffer the procedure needs.
+    - `small`: whether it is `known` or the kernel's, and could be handed over by its entries.
     """
 
     form: Hashable
@@ -44,6 +45,7 @@ class _Argument:
     place: int = -1
     lanes: bool = False
     view: View | None = None
+    small: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,8 +71,8 @@ class Procedures:
     def __init__(self) -> None:
         self.lines: list[str] = []
         self._count = 0
-        # The functions are kept, so that none has the identity of another.
-        self._known: dict[Hashable, tuple[ClosedJaxpr, _Procedure]] = {}
+        # Those of a function, with the form of their arguments. The functions are kept, so that none has the identity of another.
+        self._known: dict[Hashable, list[tuple[ClosedJaxpr, tuple[Hashable, ...], _Procedure]]] = {}
 
     def call(self, caller: "Lowering", closed: ClosedJaxpr, args: Sequence[Operand]) -> list[Any]:
         """Writes a call, and the procedure where there is none yet of this form; gives its results."""
@@ -78,10 +80,15 @@ class Procedures:
         temporary: list[Buffer] = []
         avals = [v.aval for v in closed.jaxpr.invars]
         handed = {k: _handed(caller, args[k], avals[k], temporary) for k in _used(caller.inlined(closed))}
-        form = identity(closed), *(each.form for each in handed.values()), code.mask is None
-        if form not in self._known:
-            self._known[form] = closed, self._written(caller, closed, handed)
-        made = self._known[form][1]
+        known = self._known.setdefault((identity(closed), code.mask is None), [])
+        found = next((x for x in known if _takes(x[1], handed)), None)
+        if found is None:
+            found = closed, tuple(each.form for each in handed.values()), self._written(caller, closed, handed)
+            known.append(found)
+        _, forms, made = found
+        for form, (k, each) in zip(forms, handed.items(), strict=True):
+            if form != each.form:
+                handed[k] = _as_entries(caller, args[k], avals[k])
         operands = ["ptr %args"]
         operands += [
             f"{kind} {x}" for each in handed.values() for kind, x in zip(each.types, each.operands, strict=True)
@@ -151,20 +158,35 @@ def _used(inlined: ClosedJaxpr) -> list[int]:
     return [k for k, v in enumerate(inlined.jaxpr.invars) if v in read]
 
 
+# Whatever is the same in all lanes can be handed over so, if it is small.
+_SAME = "entries", False
+
+
+def _takes(forms: Sequence[Hashable], handed: dict[int, _Argument]) -> bool:
+    """Whether a procedure with arguments of these forms can be called: what is known, or the kernel's, goes as other numbers do."""
+    return all(
+        form in (each.form, _SAME if each.small else None) for form, each in zip(forms, handed.values(), strict=True)
+    )
+
+
+def _as_entries(caller: "Lowering", x: Operand, aval: Aval) -> _Argument:
+    entries = caller.memory.entries(caller.memory.materialised(x))
+    lanes = has_lanes(entries)
+    types = [caller.code.type(kind, lanes) for kind in kinds_of(aval)]
+    return _Argument(("entries", lanes), types, texts(caller.code, aval, entries, lanes), lanes=lanes)
+
+
 def _handed(caller: "Lowering", x: Operand, aval: Aval, temporary: list[Buffer]) -> _Argument:
     code, memory = caller.code, caller.memory
     place = caller.place_of(x)
     if place >= 0:
-        return _Argument(("place", place), place=place)
+        return _Argument(("place", place), place=place, small=x.size <= THRESHOLDS.carried)
     x = memory.materialised(x)
     known = _known(x, aval) if x.size <= THRESHOLDS.carried else None
     if known is not None:
-        return _Argument(("known", known.dtype, known.shape, known.tobytes()), known=known)
+        return _Argument(("known", known.dtype, known.shape, known.tobytes()), known=known, small=True)
     if x.size <= THRESHOLDS.carried:
-        entries = memory.entries(x)
-        lanes = has_lanes(entries)
-        types = [code.type(kind, lanes) for kind in kinds_of(aval)]
-        return _Argument(("entries", lanes), types, texts(code, aval, entries, lanes), lanes=lanes)
+        return _as_entries(caller, x, aval)
     view = memory.view(x, aval.dtype)
     if not view.contiguous or (isinstance(view.offset, Value) and view.offset.lanes):
         view = memory.copied(view, aval.dtype)
