@@ -74,7 +74,7 @@ class Instructions:
         """An operand without its type."""
         if isinstance(x, Value):
             return self.in_lanes(x).name if lanes else x.name
-        if isinstance(x, Complex) or np.iscomplexobj(x):
+        if isinstance(x, Complex | complex | np.complexfloating):
             raise TypeError("a complex number where a real one is written")
         if kind == "double" or kind == "float":
             literal = f"0x{struct.pack('>d', float(x)).hex().upper()}"
