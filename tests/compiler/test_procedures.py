@@ -101,6 +101,22 @@ def test_complex_numbers_and_derivatives():
     np.testing.assert_allclose(jax.grad(compiler.jit(fn))(0.4), jax.grad(fn)(0.4), rtol=1e-12)
 
 
+def test_one_procedure_for_what_is_known_too():
+    """And for arguments of the kernel, where it has been written for other numbers."""
+
+    @jax.jit
+    def wave(x, y):
+        return jnp.sin(x) * y + jnp.cos(y)
+
+    def fn(x, y):
+        return wave(jnp.sin(x), 2 * y) + 3 * wave(x, np.arange(6.0)) + wave(np.full(6, -0.0), y)
+
+    assert written(jax.make_jaxpr(fn)(X, X)).count("define internal") == 1
+    np.testing.assert_allclose(compiler.jit(fn)(X, X + 1), fn(X, X + 1), rtol=1e-13)
+    xs = jnp.outer(jnp.arange(-3, 8), X)
+    np.testing.assert_allclose(jax.vmap(compiler.jit(fn), (0, None))(xs, X), jax.vmap(fn, (0, None))(xs, X), rtol=1e-13)
+
+
 def test_only_what_is_called_again_and_is_large(monkeypatch):
     jaxpr = jax.make_jaxpr(main)(X, C, 3)
     assert len(repeated(jaxpr)) > 1
