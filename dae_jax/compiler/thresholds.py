@@ -50,7 +50,7 @@ class Thresholds:
       nothing that is there twice. In between the function is written to see.
     - `whole`, `procedure`: in a program of more than `whole` instructions, before equal ones are found (a quarter to two thirds are
       left), a function that is called at several places is a procedure if it has more than `procedure`. A body in space on a hinge
-      (57,000) takes 22,000 lines in place of 83,000, its gradient 111,000 in place of 142,000: ready in 7 s in place of 14, and in 25 in
+      (57,000) takes 20,000 lines in place of 83,000, its gradient 96,000 in place of 142,000: ready in 7 s in place of 14, and in 25 in
       place of 38, in 1.8 and 3.1 ms, 15 and 23; two such bodies 11 and 27 s, 5.9 and 8.3 ms; the gradient of Andrews' mechanism by Radau
       (64,000) 24 and 43 s, both 112 ms. A double pendulum (4,800) is faster by a fifth with all in one.
     - `loop_cost`: a loop over an array takes about as many instructions as this many entries do.

@@ -11,7 +11,7 @@ from jax.extend.core.primitives import closed_call_p
 
 from ..thresholds import THRESHOLDS
 from ..types import Atom, Equation
-from .walk import PLAIN, atom_key, called, identity
+from .walk import PLAIN, atom_key, called, identity, needed_for, once_each
 
 
 class _Function(NamedTuple):
@@ -32,17 +32,11 @@ class EqualFunctions:
     """
 
     def __init__(self) -> None:
-        # What is looked at is kept, so that its identity is nobody else's.
-        self._known: dict[Hashable, tuple[ClosedJaxpr, ClosedJaxpr]] = {}
-        self._ran: dict[Hashable, tuple[ClosedJaxpr, ClosedJaxpr]] = {}
-        self._called: dict[Hashable, tuple[ClosedJaxpr, _Function]] = {}
         self._first: dict[Hashable, ClosedJaxpr] = {}
+        self._found, self._run, self._function = map(once_each, (self._within, self._first_run, self._first_called))
 
     def __call__(self, closed: ClosedJaxpr) -> ClosedJaxpr:
-        key = identity(closed)
-        if key not in self._known:
-            self._known[key] = closed, self._within(closed)
-        return self._known[key][1]
+        return self._found(closed)
 
     def _within(self, closed: ClosedJaxpr) -> ClosedJaxpr:
         env, eqns = {}, []
@@ -75,24 +69,18 @@ class EqualFunctions:
         leaves, treedef = jax.tree.flatten(param, is_leaf=_is_closed)
         return treedef.unflatten(map(self._param, leaves)) if any(map(_is_closed, leaves)) else param
 
-    def _run(self, closed: ClosedJaxpr) -> ClosedJaxpr:
+    def _first_run(self, closed: ClosedJaxpr) -> ClosedJaxpr:
         """The first of all that are equal to this one, of what loops and branches run."""
-        key = identity(closed)
-        if key not in self._ran:
-            found = self(closed)
-            jaxpr = found.jaxpr
-            eqns, _ = _in_order(jaxpr, jaxpr.outvars)
-            content = _content((*jaxpr.constvars, *jaxpr.invars), found.consts, eqns, jaxpr.outvars)
-            self._ran[key] = closed, self._first.setdefault(content, found)
-        return self._ran[key][1]
+        found = self(closed)
+        jaxpr = found.jaxpr
+        eqns, _ = _in_order(jaxpr, jaxpr.outvars)
+        content = _content((*jaxpr.constvars, *jaxpr.invars), found.consts, eqns, jaxpr.outvars)
+        return self._first.setdefault(content, found)
 
-    def _function(self, closed: ClosedJaxpr) -> _Function:
+    def _first_called(self, closed: ClosedJaxpr) -> _Function:
         """The first of all functions that are equal to this one."""
-        key = identity(closed)
-        if key not in self._called:
-            found, content = _parted(self(closed))
-            self._called[key] = closed, found._replace(closed=self._first.setdefault(content, found.closed))
-        return self._called[key][1]
+        found, content = _parted(self(closed))
+        return found._replace(closed=self._first.setdefault(content, found.closed))
 
 
 def _is_closed(x: object) -> bool:
@@ -120,13 +108,12 @@ def _parted(closed: ClosedJaxpr) -> tuple[_Function, Hashable]:
     eqns, leaves = _in_order(jaxpr, outvars)
     constant = dict(zip(jaxpr.constvars, closed.consts, strict=True))
     constvars, invars = [v for v in leaves if v in constant], [v for v in leaves if v in place]
-    needed = set(map(id, eqns))
-    kept = [eqn for eqn in jaxpr.eqns if id(eqn) in needed]
+    kept, _ = needed_for(outvars, jaxpr.eqns)
     found = ClosedJaxpr(
         jaxpr.replace(constvars=constvars, invars=invars, outvars=outvars, eqns=kept),
         [constant[v] for v in constvars],
     )
-    content = "called", _content((*constvars, *invars), found.consts, eqns, outvars)
+    content = _content((*constvars, *invars), found.consts, eqns, outvars)
     return _Function(found, [place[v] for v in invars], computed, given), content
 
 
@@ -134,7 +121,7 @@ def _in_order(jaxpr: Jaxpr, outvars: Iterable[Atom]) -> tuple[list[JaxprEqn], li
     """The equations that results need, and the variables that come from outside, each when it is needed first."""
     source = {v: eqn for eqn in jaxpr.eqns for v in eqn.outvars}
     eqns, leaves, seen = [], {}, set()
-    roots = [*(v for v in outvars), *(v for eqn in jaxpr.eqns if eqn.effects for v in eqn.outvars)]
+    roots = [*outvars, *(v for eqn in jaxpr.eqns if eqn.effects for v in eqn.outvars)]
     waiting: list[Any] = [v for v in reversed(roots) if isinstance(v, Var)]
     while waiting:
         top = waiting.pop()

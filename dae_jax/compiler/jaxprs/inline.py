@@ -11,7 +11,7 @@ from jaxtyping import Array
 from ..types import Atom, Aval, Equation, Params, aval_of
 from .few_turns import written_out
 from .special_functions import SPECIAL, by_simpler_ones
-from .walk import atom_key, called, identity, needed_for, of_solve
+from .walk import atom_key, called, identity, needed_for, of_solve, once_each
 
 
 # They give their first operand, or what is said here; others of equinox mean something to transformations only.
@@ -39,14 +39,10 @@ class Inlining:
 
     def __init__(self, procedures: frozenset[Hashable] = frozenset()) -> None:
         self.procedures = procedures
-        self._known: dict[Hashable, tuple[ClosedJaxpr, ClosedJaxpr]] = {}
+        self._found = once_each(lambda closed: _flat(closed, self))
 
     def __call__(self, closed: ClosedJaxpr) -> ClosedJaxpr:
-        key = identity(closed)
-        if key not in self._known:
-            # The first is kept so that its identity is nobody else's.
-            self._known[key] = closed, _flat(closed, self)
-        return self._known[key][1]
+        return self._found(closed)
 
 
 def _flat(closed: ClosedJaxpr, inlined: Inlining) -> ClosedJaxpr:

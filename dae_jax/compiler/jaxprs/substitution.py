@@ -1,13 +1,13 @@
 """Jaxprs with some of their equations, at any depth, replaced by what others compute; nothing is traced again."""
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
 
 from ..types import Atom, Equation
-from .walk import PLAIN, called, identity
+from .walk import PLAIN, called, once_each
 
 
 class Substitution:
@@ -23,14 +23,10 @@ class Substitution:
         enters: Callable[[Equation], bool] = lambda _: True,
     ) -> None:
         self._replacement, self._enters = replacement, enters
-        self._known: dict[Hashable, tuple[ClosedJaxpr, ClosedJaxpr]] = {}
+        self._found = once_each(self._substituted)
 
     def __call__(self, closed: ClosedJaxpr) -> ClosedJaxpr:
-        key = identity(closed)
-        if key not in self._known:
-            # The first is kept so that its identity is nobody else's.
-            self._known[key] = closed, self._substituted(closed)
-        return self._known[key][1]
+        return self._found(closed)
 
     def _substituted(self, closed: ClosedJaxpr) -> ClosedJaxpr:
         found, env = _Equations(), {}

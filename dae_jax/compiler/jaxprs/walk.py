@@ -111,6 +111,20 @@ def identity(closed: ClosedJaxpr) -> Hashable:
     return id(closed.jaxpr), *map(id, closed.consts)
 
 
+def once_each(of: Callable[[ClosedJaxpr], T]) -> Callable[[ClosedJaxpr], T]:
+    """`of`, which is asked once of each function."""
+    # The functions are kept, so that none has the identity of another.
+    known: dict[Hashable, tuple[ClosedJaxpr, T]] = {}
+
+    def found(closed: ClosedJaxpr) -> T:
+        key = identity(closed)
+        if key not in known:
+            known[key] = closed, of(closed)
+        return known[key][1]
+
+    return found
+
+
 def atom_key(x: Atom) -> Hashable:
     """What is the same of a variable, or of a constant in its place, wherever it stands."""
     # By its bits: 0 and −0 are equal, and not the same; its text has eight digits.

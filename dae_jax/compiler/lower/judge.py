@@ -22,7 +22,7 @@ from .dtypes import ALL
 from .lowering import TooLarge
 from .module_text import module_text
 from .registry import RULES, named, quoted
-from .repeated import repeated
+from .repeated import is_large, repeated
 
 
 def annotate(
@@ -50,8 +50,11 @@ def unsupported(
 
 @functools.lru_cache(maxsize=4)
 def _annotated(jaxpr: ClosedJaxpr, batched: tuple[bool, ...], target: Target) -> Annotated | Unsupported:
-    whole = EqualFunctions()(without_keys(jaxpr))
-    inlined = Inlining(frozenset() if target.threads else repeated(whole))
+    whole, procedures = without_keys(jaxpr), frozenset()
+    if not target.threads and is_large(whole):
+        whole = EqualFunctions()(whole)
+        procedures = repeated(whole)
+    inlined = Inlining(procedures)
     found = next(_unsupported(inlined(whole), inlined, target), None)
     return found or _unless_too_large(estimate.annotated(inlined(whole), batched, inlined, target))
 

@@ -35,7 +35,6 @@ class _Argument:
 
     - `known`: its numbers, where these are known; `place`: that of the kernel's argument that it is, from 0 on, or −1.
     - `lanes`: whether it differs from lane to lane; `view`: an array in memory, whose kind of buffer the procedure needs.
-    - `small`: whether it is `known` or the kernel's, and could be handed over by its entries.
     """
 
     form: Hashable
@@ -45,7 +44,6 @@ class _Argument:
     place: int = -1
     lanes: bool = False
     view: View | None = None
-    small: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,13 +84,12 @@ class Procedures:
             found = closed, tuple(each.form for each in handed.values()), self._written(caller, closed, handed)
             known.append(found)
         _, forms, made = found
-        for form, (k, each) in zip(forms, handed.items(), strict=True):
-            if form != each.form:
-                handed[k] = _as_entries(caller, args[k], avals[k])
-        operands = ["ptr %args"]
-        operands += [
-            f"{kind} {x}" for each in handed.values() for kind, x in zip(each.types, each.operands, strict=True)
+        passed = [
+            each if form == each.form else _as_entries(caller, args[k], avals[k])
+            for form, (k, each) in zip(forms, handed.items(), strict=True)
         ]
+        operands = ["ptr %args"]
+        operands += [f"{kind} {x}" for each in passed for kind, x in zip(each.types, each.operands, strict=True)]
         if code.mask is not None:
             operands.append(f"{code.type('i1', True)} {code.text(code.mask, 'i1', True)}")
         outs = []
@@ -158,14 +155,16 @@ def _used(inlined: ClosedJaxpr) -> list[int]:
     return [k for k, v in enumerate(inlined.jaxpr.invars) if v in read]
 
 
-# Whatever is the same in all lanes can be handed over so, if it is small.
+# Of what is the same in all lanes, where it is small.
 _SAME = "entries", False
 
 
 def _takes(forms: Sequence[Hashable], handed: dict[int, _Argument]) -> bool:
     """Whether a procedure with arguments of these forms can be called: what is known, or the kernel's, goes as other numbers do."""
+    special = lambda each: each.known is not None or each.place >= 0
     return all(
-        form in (each.form, _SAME if each.small else None) for form, each in zip(forms, handed.values(), strict=True)
+        form == each.form or (form == _SAME and special(each))
+        for form, each in zip(forms, handed.values(), strict=True)
     )
 
 
@@ -180,11 +179,11 @@ def _handed(caller: "Lowering", x: Operand, aval: Aval, temporary: list[Buffer])
     code, memory = caller.code, caller.memory
     place = caller.place_of(x)
     if place >= 0:
-        return _Argument(("place", place), place=place, small=x.size <= THRESHOLDS.carried)
+        return _Argument(("place", place), place=place)
     x = memory.materialised(x)
     known = _known(x, aval) if x.size <= THRESHOLDS.carried else None
     if known is not None:
-        return _Argument(("known", known.dtype, known.shape, known.tobytes()), known=known, small=True)
+        return _Argument(("known", known.dtype, known.shape, known.tobytes()), known=known)
     if x.size <= THRESHOLDS.carried:
         return _as_entries(caller, x, aval)
     view = memory.view(x, aval.dtype)

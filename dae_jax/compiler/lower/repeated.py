@@ -11,13 +11,15 @@ from ..types import Equation
 from .registry import RULES
 
 
+def is_large(closed: ClosedJaxpr) -> bool:
+    """Whether functions of a program become procedures; as a part of its surroundings a function is faster by a fifth."""
+    return _visit(closed, {})[1] > THRESHOLDS.whole
+
+
 def repeated(closed: ClosedJaxpr) -> frozenset[Hashable]:
     """The identities of these functions."""
     functions: dict[Hashable, tuple[int, Counter[tuple[Hashable, bool]]]] = {}
-    _, whole = _visit(closed, functions)
-    if whole <= THRESHOLDS.whole:
-        # A function is faster by a fifth as a part of its surroundings.
-        return frozenset()
+    _visit(closed, functions)
     places, found = Counter({identity(closed): 1}), set()
     # Who calls comes after what it calls.
     for function, (size, held) in reversed(functions.items()):
