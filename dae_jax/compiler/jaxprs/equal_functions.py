@@ -11,7 +11,7 @@ from jax.extend.core.primitives import closed_call_p
 
 from ..thresholds import THRESHOLDS
 from ..types import Atom, Equation
-from .walk import PLAIN, atom_key, called, identity, needed_for, once_each
+from .walk import PLAIN, atom_key, called, needed_for, once_each, params_key
 
 
 class _Function(NamedTuple):
@@ -33,7 +33,9 @@ class EqualFunctions:
 
     def __init__(self) -> None:
         self._first: dict[Hashable, ClosedJaxpr] = {}
-        self._found, self._run, self._function = map(once_each, (self._within, self._first_run, self._first_called))
+        self._found = once_each(self._within)
+        self._run = once_each(self._first_run)
+        self._function = once_each(self._first_called)
 
     def __call__(self, closed: ClosedJaxpr) -> ClosedJaxpr:
         return self._found(closed)
@@ -143,25 +145,8 @@ def _content(
     defined = lambda vs: tuple((number.setdefault(v, len(number)), v.aval) for v in vs)
     used = lambda vs: tuple(number[v] if isinstance(v, Var) else atom_key(v) for v in vs)
     given = defined(arguments), tuple(map(_constant, constants))
-    found = tuple((eqn.primitive, _asked(eqn), used(eqn.invars), defined(eqn.outvars)) for eqn in eqns)
+    found = tuple((eqn.primitive, params_key(eqn.params), used(eqn.invars), defined(eqn.outvars)) for eqn in eqns)
     return given, found, used(outvars)
-
-
-def _asked(eqn: Equation) -> Hashable:
-    return tuple((name, _value(param)) for name, param in eqn.params.items())
-
-
-def _value(param: Any) -> Hashable:
-    if isinstance(param, ClosedJaxpr):
-        return identity(param)
-    if isinstance(param, tuple | list):
-        return type(param), tuple(map(_value, param))
-    try:
-        hash(param)
-    except TypeError:
-        return id(param)
-    # 1, 1.0 and True are equal.
-    return type(param), param
 
 
 def _constant(x: Any) -> Hashable:

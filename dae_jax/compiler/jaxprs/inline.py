@@ -8,10 +8,10 @@ import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Primitive, Var, jaxpr_as_fun
 from jaxtyping import Array
 
-from ..types import Atom, Aval, Equation, Params, aval_of
+from ..types import Atom, Aval, Equation, aval_of
 from .few_turns import written_out
 from .special_functions import SPECIAL, by_simpler_ones
-from .walk import atom_key, called, identity, needed_for, of_solve, once_each
+from .walk import atom_key, called, identity, needed_for, of_solve, once_each, params_key
 
 
 # They give their first operand, or what is said here; others of equinox mean something to transformations only.
@@ -96,8 +96,8 @@ class _Flat:
         if name in _SAME_IF_SO_SHAPED and _like(aval_of(args[0]), aval_of(eqn.outvars[0])):
             return args[:1]
         atoms = list(map(atom_key, args))
-        key = (name, _key(eqn.params), frozenset(atoms) if name in _COMMUTATIVE else tuple(atoms))
-        found = None if eqn.effects or key[1] is None else self._known.get(key)
+        key = (name, params_key(eqn.params), frozenset(atoms) if name in _COMMUTATIVE else tuple(atoms))
+        found = None if eqn.effects else self._known.get(key)
         if found is None:
             found = self._known[key] = [Var(v.aval) for v in eqn.outvars]
             self.eqns.append(eqn.replace(invars=args, outvars=found))
@@ -132,15 +132,6 @@ def _until_all_are_done(eqn: JaxprEqn, args: list[Atom]) -> tuple[JaxprEqn, list
 
 def _like(a: Aval, b: Aval) -> bool:
     return a.shape == b.shape and a.dtype == b.dtype
-
-
-def _key(params: Params) -> Hashable:
-    key = tuple(sorted(params.items()))
-    try:
-        hash(key)
-    except TypeError:
-        return None
-    return key
 
 
 def _meaning(eqn: Equation) -> ClosedJaxpr:

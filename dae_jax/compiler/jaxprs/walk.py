@@ -131,6 +131,24 @@ def atom_key(x: Atom) -> Hashable:
     return (np.asarray(x.val).tobytes(), aval_of(x).dtype) if isinstance(x, Literal) else x
 
 
+def params_key(params: Params) -> Hashable:
+    """What equal equations have in common beside their operands."""
+    return tuple((name, _param_key(params[name])) for name in sorted(params))
+
+
+def _param_key(param: Any) -> Hashable:
+    if isinstance(param, ClosedJaxpr):
+        return identity(param)
+    if isinstance(param, tuple | list):
+        return type(param), tuple(map(_param_key, param))
+    try:
+        hash(param)
+    except TypeError:
+        return id(param)
+    # 1, 1.0 and True are equal.
+    return type(param), param
+
+
 def needed_for(outputs: Iterable[Any], eqns: Sequence[Any]) -> tuple[list[Any], set[Any]]:
     """Those of the equations that outputs, or effects, need, and all variables that are needed."""
     needed, kept = {v for v in outputs if isinstance(v, Var)}, []
