@@ -70,10 +70,8 @@ def _main(argv: list[str] | None) -> int:
 
 
 def _add_compare(commands: argparse._SubParsersAction) -> None:
-    from ..scenes import SCENES
-
     parser = commands.add_parser("compare", help="solve a scene by every method; print a table and draw the figures")
-    parser.add_argument("scene", metavar="SCENE", help=", ".join(SCENES))
+    parser.add_argument("scene", metavar="SCENE", help=", ".join(options.scenes()))
     parser.add_argument("--methods", help="names, separated by commas; by default all")
     parser.add_argument("--t1", type=float, help="end time in s; by default the scene's own")
     parser.add_argument("--rtol", type=float, help="tolerance, relative and absolute; by default 1e-8")

@@ -113,7 +113,7 @@ def _mechanism(scene: Scene, method: str, sol: DAESolution) -> Any:
     assert drawing is not None
     times = np.asarray(sol.ts)
     early = times <= drawing.t1
-    points = jax.vmap(drawing.points)(times[early], sol.ys[0][early])
+    points = jax.vmap(drawing.points)(times[early], jax.tree.map(lambda x: x[early], sol.ys[0]))
     title = f"{scene.name} until {times[early][-1]:.3g} s, by {method}"
     return plotting.mechanism(
         times[early], points, drawing.masses, drawing.links, drawing.springs, down=drawing.down,

@@ -2,6 +2,7 @@
 
 import argparse
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +11,19 @@ from typing import Any
 TIGHTEST = 1e-14
 
 
-def scene(parser: argparse.ArgumentParser, name: str, advice: str = "") -> Any:
-    """The ready scene of this name; `advice`: what else there is."""
+def scenes() -> dict[str, Callable[[], Any]]:
+    """The ready scenes by name, those of bodies and joints too."""
+    from ..mechanisms import EXAMPLES
     from ..scenes import SCENES
 
-    if name not in SCENES:
-        parser.error(f"unknown scene {name!r}; choose from {', '.join(SCENES)}{advice}")
-    return SCENES[name]()
+    return {**SCENES, **EXAMPLES}
+
+
+def scene(parser: argparse.ArgumentParser, name: str, advice: str = "") -> Any:
+    """The ready scene of this name; `advice`: what else there is."""
+    if name not in scenes():
+        parser.error(f"unknown scene {name!r}; choose from {', '.join(scenes())}{advice}")
+    return scenes()[name]()
 
 
 def mechanism(parser: argparse.ArgumentParser, name: str) -> Any:
@@ -31,11 +38,9 @@ def mechanism(parser: argparse.ArgumentParser, name: str) -> Any:
 
 def drawn(parser: argparse.ArgumentParser, name: str) -> Any:
     """The same, of a scene that has a drawing."""
-    from ..scenes import SCENES
-
     found = scene(parser, name)
     if found.drawing is None:
-        others = [other for other, make in SCENES.items() if make().drawing is not None]
+        others = [other for other, make in scenes().items() if make().drawing is not None]
         parser.error(f"{name} has no drawing; choose from {', '.join(others)}")
     return found
 

@@ -10,8 +10,16 @@ from .contacts import (
 )
 from .couplings import coupling as coupling
 from .examples import (
+    EXAMPLES as EXAMPLES,
+    delta as delta,
+    delta_robot as delta_robot,
+    disc as disc,
+    engine as engine,
+    engine_with_four_cylinders as engine_with_four_cylinders,
     five_bar as five_bar,
     five_bar_linkage as five_bar_linkage,
+    rolling_disc as rolling_disc,
+    stewart as stewart,
     stewart_platform as stewart_platform,
 )
 from .interface import AbstractJoint as AbstractJoint

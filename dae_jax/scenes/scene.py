@@ -128,7 +128,8 @@ def minimal(
         times = np.frombuffer(moments)
         points = np.unique(np.concatenate([[0.0], times]))
         rows, begin, z = [embed(0.0, np.asarray(z0, float))], 0.0, z0
-        for end in [*(kink for kink in kinks if kink < points[-1]), points[-1] or 1.0]:
+        last = points[-1]
+        for end in [*(kink for kink in kinks if kink < last), last] if last else []:
             # A jump at a kink belongs to what comes after it.
             stop = np.nextafter(end, 0) if end in kinks else end
             wanted = np.minimum(points[(points > begin) & (points <= end)], stop)

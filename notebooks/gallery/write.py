@@ -26,6 +26,7 @@ import dae_jax
 from dae_jax import plotting
 from dae_jax.app.compare import chosen, measure, solve
 from dae_jax.app.figures import figures
+from dae_jax.app.options import scenes as ready
 
 
 HERE = Path(__file__).parent
@@ -54,7 +55,8 @@ This page is written by `python notebooks/gallery/write.py`.
 """
 SCENES_HEAD = f"""# Scenes
 
-Ready systems: `dae_jax.scenes.SCENES["pendulum"]()` is one, `dae-jax compare pendulum` solves it by every method. Each has a
+Ready systems: `dae_jax.scenes.SCENES["pendulum"]()` is one, of bodies and joints `dae_jax.mechanisms.EXAMPLES["engine"]()`, whose
+mechanism is there too; `dae-jax compare pendulum` solves one by every method, `dae-jax animate engine` shows it. Each has a
 reference that is independent of the library: a closed form, a tight solve in minimal coordinates by scipy, or a published end.
 The error is the largest against it, at a tolerance of {RTOL:g}, of all entries, multipliers and accelerations too where they are
 unknowns; relative where the solution is larger than the scene's scale.
@@ -114,7 +116,7 @@ def method_of(scene: Any) -> str:
 
 def picture(name: str) -> bytes:
     """A scene, solved and drawn."""
-    scene = dae_jax.scenes.SCENES[name]()
+    scene = ready()[name]()
     method = method_of(scene)
     row, sol = measure(scene, method, chosen(scene, [method])[method], scene.times(scene.t1, 501), RTOL)
     if sol is None:
@@ -127,7 +129,7 @@ def picture(name: str) -> bytes:
 
 def film(name: str, t1: float) -> plotting.Animation:
     """A scene as it moves."""
-    scene = dae_jax.scenes.SCENES[name]()
+    scene = ready()[name]()
     method = method_of(scene)
     times = np.linspace(0, t1, round(50 * t1) + 1)
     return plotting.animate(scene, solve(scene, chosen(scene, [method])[method], times, RTOL))
@@ -140,11 +142,12 @@ def scenes() -> str:
 
 
 def _scene_rows() -> Iterator[str]:
-    for name, make in dae_jax.scenes.SCENES.items():
+    for name, make in ready().items():
         function = getattr(make, "func", make)
         about = (inspect.getdoc(function) or "").split("\n\n")[0].replace("\n", " ").replace("|", r"\|").rstrip(":")
         shown = said(HERE / "scenes" / f"{name}.png")
-        links = f"[`{function.__name__}`](reference/scenes.md#scenes{function.__name__})"
+        page = function.__module__.split(".")[1]
+        links = f"[`{function.__name__}`](reference/{page}.md#{page}{function.__name__})"
         yield (
             f"| ![{name}](gallery/scenes/{name}.png) | **{name}**, {links}, index {make().index}<br>{about}<br>"
             f"By `{shown['method']}`: error {shown['error']} |"
@@ -158,7 +161,7 @@ def main() -> None:
         figure = first_figure(notebook)
         (HERE / f"{name}.png").write_bytes(thumbnail(figure, figure=digest(figure)))
     (NOTEBOOKS / "README.md").write_text(index())
-    for name in sys.argv[1:] or dae_jax.scenes.SCENES:
+    for name in sys.argv[1:] or ready():
         print(name, file=sys.stderr, flush=True)
         (HERE / "scenes" / f"{name}.png").write_bytes(picture(name))
         if name == MOVING[0]:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-import dae_jax
+from dae_jax.app.options import scenes
 
 
 GALLERY = Path(__file__).parents[2] / "notebooks" / "gallery"
@@ -46,7 +46,7 @@ def test_thumbnails_are_of_the_first_figures(gallery):
 
 
 def test_every_scene_has_its_picture(gallery):
-    assert {path.stem for path in (GALLERY / "scenes").glob("*.png")} == set(dae_jax.scenes.SCENES)
+    assert {path.stem for path in (GALLERY / "scenes").glob("*.png")} == set(scenes())
     for path in GALLERY.rglob("*.png"):
         assert path.stat().st_size < 30_000
         with Image.open(path) as image:

@@ -1,9 +1,10 @@
-"""The ready mechanisms: a five-bar against minimal coordinates, a Stewart platform against what it keeps."""
+"""The ready mechanisms, against minimal coordinates, and by what they keep."""
 
 import diffrax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import simpson
 
 import dae_jax
 from dae_jax import mechanisms as m
@@ -14,11 +15,19 @@ from dae_jax.linalg import SparseDefinite
 
 
 SOLVER = dae_jax.OrthogonalProjection(dae_jax.DOP853())
+MECHANISMS = {
+    "delta": m.delta_robot,
+    "engine": m.engine_with_four_cylinders,
+    "five-bar": m.five_bar_linkage,
+    "rolling-disc": m.rolling_disc,
+    "stewart": m.stewart_platform,
+}
 
 
-def test_a_five_bar_with_a_motor_moves_as_in_minimal_coordinates():
-    scene = m.five_bar()
-    times = np.linspace(0, scene.t1, 7)
+@pytest.mark.parametrize("name", m.EXAMPLES)
+def test_a_mechanism_moves_as_in_minimal_coordinates_and_its_energy_is_what_is_put_in(name: str):
+    scene, mechanism = m.EXAMPLES[name](), MECHANISMS[name]()
+    times = np.linspace(0, scene.t1, 4001)
     sol = dae_jax.daesolve(
         scene.system,
         SOLVER,
@@ -27,12 +36,43 @@ def test_a_five_bar_with_a_motor_moves_as_in_minimal_coordinates():
         None,
         scene.y0,
         saveat=diffrax.SaveAt(ts=jnp.asarray(times)),
-        stepsize_controller=diffrax.PIDController(rtol=1e-11, atol=1e-11),
+        stepsize_controller=diffrax.PIDController(rtol=1e-10, atol=1e-10),
     )
-    assert scene.error(times, sol.ys) < 1e-8
+    some = slice(None, None, 800)
+    assert scene.error(times[some], tuple(m.Coordinates(x.values[some], x.names) for x in sol.ys)) < 1e-8
+    assert float(jnp.max(dae_jax.drift(scene.system, sol).position)) < 1e-13
+    energy = np.asarray(mechanism.energy(sol))
+    put_in = np.sum([np.asarray(x) for x in mechanism.power(sol).values()] + [0 * times], axis=0)
+    size = np.abs(energy).max() + simpson(np.abs(put_in), x=times)
+    for end in (2000, 4000):
+        assert abs(energy[end] - energy[0] - simpson(put_in[: end + 1], x=times[: end + 1])) < 1e-7 * size
+
+
+@pytest.mark.parametrize("name", m.EXAMPLES)
+def test_a_reference_starts_where_the_mechanism_is_assembled(name: str):
+    """The reference configuration, of bodies and joints, is that of the closed forms, whose state is consistent."""
+    (q, v), mechanism = m.EXAMPLES[name]().y0, MECHANISMS[name]()
+    assert np.allclose(mechanism.assemble()[0].values, q.values, rtol=0, atol=1e-12)
+    at, moving = mechanism.assemble(({body: q[body] for body in q.names}, {body: v[body] for body in v.names}))
+    assert np.allclose(at.values, q.values, rtol=0, atol=1e-12)
+    assert np.allclose(moving.values, v.values, rtol=0, atol=1e-12 * np.abs(v.values).max())
+
+
+def test_a_wheel_is_drawn_as_its_rim():
+    scene = m.disc()
     drawn = scene.drawing
     assert drawn is not None
-    assert drawn.points(0.0, scene.y0[0]).shape == (4 + 2 * 5, 2)
+    points = np.asarray(drawn.points(0.0, scene.y0[0]))
+    rim = sorted({end for pair in drawn.links for end in pair if pair[0] > 2})
+    assert np.allclose(np.linalg.norm(points[rim] - points[0], axis=1), 0.3)
+    # It touches the ground, and does not go below it.
+    assert -1e-12 < points[rim, 2].min() < 0.01
+
+
+def test_a_five_bar_is_drawn_with_its_joints():
+    drawn = m.five_bar().drawing
+    assert drawn is not None
+    assert drawn.points(0.0, m.five_bar().y0[0]).shape == (4 + 2 * 5, 2)
     assert max(max(pair) for pair in drawn.links) < 14
 
 
