@@ -1,4 +1,4 @@
-"""Problems of the IVP test set on which solvers stop: kinks in time and in charges at nanoseconds, an elastic rod."""
+"""Problems of the IVP test set on which solvers stop: kinks in time and in charges at nanoseconds, an elastic rod, water in tubes."""
 
 import diffrax
 import jax
@@ -70,3 +70,57 @@ def test_the_wheelset_starts_as_published():
     rates[5:8] = -1.975258894011285, -1.0898297102811276e-3, 7.8855083626142589e-2
     rates[8:11] = -5.533362821731549, -0.3487021489546511, -2.132968724380927
     np.testing.assert_allclose(scene.system.residual(0.0, jnp.asarray(scene.y0), rates, None), 0, atol=1e-13)
+
+
+# Of the water tubes: from which node to which each leads, and the nodes in the order of their pressures, two buffers first.
+TUBES = (
+    (1, 2, 2, 3, 3, 4, 5, 6, 7, 7, 8, 8, 9, 11, 11, 12, 12, 13),
+    (2, 3, 6, 4, 5, 5, 10, 5, 4, 8, 5, 10, 8, 9, 12, 7, 8, 11),
+)
+NODES = [5, 8, 1, 2, 3, 4, 6, 7, 9, 10, 11, 12, 13]
+AREA = np.pi / 4
+
+
+def water(t, y, yd, args):
+    """Flows, frictions and pressures, y = (φ, λ, p): a tube is turbulent beyond a Reynolds number of 2300."""
+    flow, friction, pressure = y[:18], y[18:36], y[36:]
+    first, last = (np.array([NODES.index(node) for node in ends]) for ends in TUBES)
+    hours = t / 3600
+    supply, demand = 1 - jnp.cos(jnp.exp(-hours) - 1), hours**2 * (3 * hours**2 - 92 * hours + 720) / 1e6
+    outside = [(1, supply / 200), (13, supply / 80), (10, -demand)]
+    net = sum(jnp.zeros(13).at[NODES.index(node)].set(value) for node, value in outside)
+    net = net.at[last].add(flow).at[first].add(-flow)
+    reynolds, root = jnp.abs(flow) / (1.31e-6 * AREA), jnp.sqrt(friction)
+    colebrook = 1 / root - 1.74 + 2 * jnp.log10(4e-4 + 18.7 / (jnp.maximum(reynolds, 2300.0) * root))
+    loss = jnp.where(reynolds > 2300, friction * 1e6 * flow**2 / AREA**2, 32 * 1.31 * flow / AREA)
+    driven = 1e6 / AREA * yd[:18] - pressure[first] + pressure[last] + loss
+    return jnp.concatenate([driven, colebrook, jnp.where(np.arange(13) < 2, 200 / 9800, 0.0) * yd[36:] - net])
+
+
+def test_water_in_tubes_ends_as_published():
+    """Problem "Water tube system" of index 2, solved by PSIDE there; friction jumps where a tube becomes turbulent, unannounced."""
+    laminar = 0.47519404529185289807e-1
+    control = diffrax.PIDController(rtol=1e-8, atol=np.repeat([1e-12, 1e-10, 1e-4], [18, 18, 13]))
+    y = dae_jax.daesolve(
+        dae_jax.ImplicitDAE(water), dae_jax.RadauIIA5(), 0.0, 61200.0, None,
+        np.repeat([0.0, laminar, 109800.0], [18, 18, 13]), stepsize_controller=control, max_steps=20_000,
+    ).ys[-1]  # fmt: skip
+    flows = [0.2298488296477430e-2, 0.1188984650746585e-2, 0.1109503645730845e-2, 0.1589620100314825e-3]
+    flows += [0.1030022640715102e-2, 0.8710606306836165e-3, 0.3243571480903489e-2, 0.1109503645730845e-2]
+    flows += [0.7120986206521341e-3, 0.6414613963833099e-3, 0.9416978549524347e-3, 0.3403428519096511e-2]
+    flows += [0.2397639310739395e-2, 0.2397639310739395e-2, 0.3348581430454180e-2, 0.1353560017035444e-2]
+    flows += [0.1995021413418736e-2, 0.5746220741193575e-2]
+    frictions = np.full(18, 0.4751940452918529e-1)
+    frictions[[6, 11, 12, 13, 14, 17]] = [
+        0.4311196778792902e-1,
+        0.4249217433601160e-1,
+        0.4732336439609648e-1,
+        0.4732336439609648e-1,
+        0.4270002118868241e-1,
+        0.3651427026675656e-1,
+    ]
+    pressures = [0.1111268591478108e6, 0.1111270045592387e6, 0.1111271078730254e6, 0.1111269851929858e6]
+    pressures += [0.1111269255355337e6, 0.1111269322658045e6, 0.1111269221703983e6, 0.1111270121140691e6]
+    pressures += [0.1111274419515807e6, 0.1111255158881087e6, 0.1111278793439227e6, 0.1111270995171642e6]
+    pressures += [0.1111298338971779e6]
+    np.testing.assert_allclose(y, [*flows, *frictions, *pressures], rtol=1e-6)
