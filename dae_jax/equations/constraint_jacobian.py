@@ -66,6 +66,10 @@ class DenseNormals:
         """A x."""
         return matvec(normals[0], x)
 
+    def freed(self, ode: Mechanism, normals: Normals, q: Flat, force: Flat) -> Flat:
+        """M⁻¹ f."""
+        return mass_solve(ode.mass(q), force)
+
     def lift(self, ode: Mechanism, normals: Normals, mu: Float[Array, " c"]) -> Float[Array, " n"]:
         """M⁻¹Aᵀ μ, of the first constraints where μ is shorter."""
         return matvec(normals[1][:, : mu.shape[0]], mu)
@@ -124,16 +128,17 @@ class SparseNormals:
     gram: Elimination | SparseDefinite
 
     @traced_once
-    def at(self, ode: Mechanism, t: Time, q: Flat, v: Flat) -> tuple[Array, ...]:
-        """The point, C there, and the factors of A M⁻¹Aᵀ where its elimination is a loop."""
+    def at(self, ode: Mechanism, t: Time, q: Flat, v: Flat) -> tuple[Array | None, ...]:
+        """The point, the masses (L of blocks), C there, and the factors of A M⁻¹Aᵀ where its elimination is a loop."""
         mass, seeds = ode.mass(q), jnp.asarray(self.seeds, q.dtype)
         if mass is not None and mass.ndim == 3:
+            mass = jnp.linalg.cholesky(mass)
             seeds = _unweighted(mass, seeds)
         compressed = self._compressed(ode, t, q, seeds)
-        point = jnp.asarray(t, q.dtype), q, compressed
+        point = jnp.asarray(t, q.dtype), q, mass, compressed
         if not isinstance(self.gram, SparseDefinite):
             return point
-        return *point, *self.gram.factors(*self._products(ode, q, compressed))
+        return *point, *self.gram.factors(*self._products(mass, compressed))
 
     def _compressed(
         self, ode: Mechanism, t: Time, q: Flat, seeds: Float[Array, "colours n"]
@@ -146,34 +151,39 @@ class SparseNormals:
         t, q, *_ = normals
         return jax.jvp(functools.partial(ode.constraint, t), (q,), (x,))[1]
 
+    def freed(self, ode: Mechanism, normals: Normals, q: Flat, force: Flat) -> Flat:
+        """M⁻¹ f."""
+        mass = normals[2]
+        if mass is None or mass.ndim < 3:
+            return mass_solve(mass, force)
+        half = jax.scipy.linalg.solve_triangular(mass, force.reshape(mass.shape[:2])[..., None], lower=True)
+        return jax.scipy.linalg.solve_triangular(mass, half, trans=1, lower=True).reshape(force.shape)
+
     @traced_once
     def lift(self, ode: Mechanism, normals: Normals, mu: Float[Array, " c"]) -> Float[Array, " n"]:
         """M⁻¹Aᵀ μ."""
         t, q, *_ = normals
         _, transpose = jax.vjp(functools.partial(ode.constraint, t), q)
-        return mass_solve(ode.mass(q), transpose(mu)[0])
+        return self.freed(ode, normals, q, transpose(mu)[0])
 
     @traced_once
     def gram_solve(self, ode: Mechanism, normals: Normals, b: Float[Array, " c"]) -> Float[Array, " c"]:
         """x with A M⁻¹Aᵀ x = b."""
-        _, q, compressed, *factors = normals
-        found = self._products(ode, q, compressed)
+        _, _, mass, compressed, *factors = normals
+        found = self._products(mass, compressed)
         if isinstance(self.gram, SparseDefinite):
             return self.gram.solve(*found, b, factors)
         return self.gram.solve(*found, b)
 
     def _products(
-        self, ode: Mechanism, q: Flat, compressed: Float[Array, "colours c"]
+        self, mass: Float[Array, "..."] | None, compressed: Float[Array, "colours c"]
     ) -> tuple[Float[Array, " c"], Float[Array, " couplings"]]:
         """The diagonal of A M⁻¹Aᵀ, and its couplings."""
-        mass = ode.mass(q)
-        rows, columns = self.gram.rows, self.gram.columns
         weighted = compressed if mass is None or mass.ndim == 3 else compressed * self._inverse_masses(mass)
-        shared = jnp.asarray(
-            (self.columns[:, rows] == self.columns[:, columns]) & (self.columns[:, rows] >= 0), q.dtype
-        )
+        rows, columns = self.gram.rows, self.gram.columns
+        shared = (self.columns[:, rows] == self.columns[:, columns]) & (self.columns[:, rows] >= 0)
         at = lambda x, entries: jax.vmap(lambda row: take(row, entries))(x)
-        couplings = jnp.sum(shared * at(weighted, rows) * at(compressed, columns), 0)
+        couplings = jnp.sum(jnp.asarray(shared, weighted.dtype) * at(weighted, rows) * at(compressed, columns), 0)
         return jnp.sum(weighted * compressed, 0), couplings
 
     def least_norm(self, ode: Mechanism, normals: Normals, b: Float[Array, " c"]) -> Float[Array, " c"]:
@@ -192,8 +202,8 @@ class SparseNormals:
 
     def _entries(self, ode: Mechanism, normals: Normals) -> Float[Array, "colours c"]:
         """C of A itself, whatever the masses."""
-        t, q, compressed, *_ = normals
-        if getattr(ode.mass(q), "ndim", 0) == 3:
+        t, q, mass, compressed, *_ = normals
+        if mass is not None and mass.ndim == 3:
             return self._compressed(ode, t, q, jnp.asarray(self.seeds, q.dtype))
         return compressed
 
@@ -234,10 +244,9 @@ def constraint_pattern(constraint: Callable[[Time, Flat], Array], t: Time, q: Fl
         return None
 
 
-def _unweighted(mass: Float[Array, "b k k"], seeds: Float[Array, "colours n"]) -> Float[Array, "colours n"]:
+def _unweighted(factor: Float[Array, "b k k"], seeds: Float[Array, "colours n"]) -> Float[Array, "colours n"]:
     """L⁻ᵀ of the blocks times each seed."""
-    factor = jnp.linalg.cholesky(mass)
-    by_block = jnp.moveaxis(seeds.reshape(len(seeds), *mass.shape[:2]), 0, -1)
+    by_block = jnp.moveaxis(seeds.reshape(len(seeds), *factor.shape[:2]), 0, -1)
     solved = jax.scipy.linalg.solve_triangular(factor, by_block, trans=1, lower=True)
     return jnp.moveaxis(solved, -1, 0).reshape(seeds.shape)
 

@@ -22,7 +22,6 @@ from .constraint_jacobian import (
     Rank,
     SparseNormals,
     constraint_pattern,
-    mass_solve,
     of_rows,
     sparse_normals,
 )
@@ -194,7 +193,7 @@ class MechanicalODE(ManifoldODE):
     def _free(self, t: Time, q: Flat, v: Flat) -> tuple[Normals, Float[Array, " n"], Float[Array, " mp"]]:
         """The normals, M⁻¹f, and A M⁻¹f + γ, which is A M⁻¹Aᵀ(λ, μ)."""
         normals = self.normals(t, (q, v))
-        free = mass_solve(self.mass(q), self.force(t, q, v))
+        free = self.linear.freed(self, normals, q, self.force(t, q, v))
         return normals, free, self.linear.along(self, normals, free) + self.bias(t, q, v)
 
     def _accelerations(self, t: Time, q: Flat, v: Flat, feedback: Feedback | None) -> Float[Array, " n"]:

@@ -21,7 +21,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..types import Args, Time
 from .bodies import Numbers
@@ -58,19 +58,21 @@ class Joint(AbstractHolonomicJoint):
     free: tuple[Kind, ...] = eqx.field(static=True)
 
     @property
-    def columns(self) -> list[int]:
-        """Which of d in the world, d along a's axes and the products of a's axes with b's (the angle in the plane) are 0."""
-        d = len(self.on_a.point)
-        # All of d are 0 in any axes, and simplest in the world's.
-        moves = list(range(d)) if len(self.locked) == d else [d + i for i in self.locked]
-        return moves + [2 * d + (0 if d == 2 else 3 * i + j) for i, j in self.perpendicular]
+    def turns(self) -> tuple[tuple[int, int], ...]:
+        """The pairs of axes that are perpendicular, in space."""
+        return self.perpendicular if len(self.on_a.point) == 3 else ()
+
+    @property
+    def slides(self) -> tuple[int, ...]:
+        """The axes of a's frame along which d is 0; none where all of d are, in any axes, and simplest in the world's."""
+        return self.locked if len(self.locked) < len(self.on_a.point) else ()
 
     def constraint(self, t: Time, at: Configuration, args: Args) -> Float[Array, " k"]:
         return pairs([self], at)
 
     def is_reversed(self, at: Configuration) -> Bool[Array, ""]:
         """Whether axes point against each other that go together: the equations, that they are perpendicular to others, allow both."""
-        pairs = set(self.perpendicular) if at.dimension == 3 else set()
+        pairs = set(self.turns)
         axes = [2] * ({(0, 2), (1, 2)} <= pairs) + [0] * ({(0, 2), (1, 2), (0, 1)} <= pairs)
         facing = [jnp.sum(self.on_a.axis(at, i) * self.on_b.axis(at, i)) for i in axes]
         return jnp.any(jnp.stack([jnp.ones(()), *facing]) < 0)
@@ -84,27 +86,54 @@ def pairs(joints: Sequence[Joint], at: Configuration) -> Float[Array, " m"]:
     """The equations of lower pairs, one after the other: all at once, so that a program does not grow with their number."""
     if not joints:
         return jnp.zeros(0, at.rows.dtype)
-    d = at.dimension
-    sides = []
-    for on in ([joint.on_a for joint in joints], [joint.on_b for joint in joints]):
-        rows = np.array([at.row(marker.body) for marker in on])
-        point, frame, angle = (jnp.stack(x) for x in zip(*(marker.arrays for marker in on), strict=True))
-        turn = at_rows(at.poses.rotation, rows)
-        place = at_rows(at.poses.position, rows) + jnp.sum(turn * point[:, None, :], 2)
-        axes = jnp.sum(turn[:, :, :, None] * frame[:, None, :, :], 2)
-        sides.append((place, axes, None if at.poses.angle is None else at_rows(at.poses.angle, rows) - angle))
-    (p_a, axes_a, turned_a), (p_b, axes_b, turned_b) = sides
-    apart = p_b - p_a
-    along = jnp.sum(axes_a * apart[:, :, None], 1)
-    # In the plane the angle, whose turns axes do not show.
-    turns = (
-        (turned_b - turned_a)[:, None]
-        if d == 2
-        else jnp.sum(axes_a[:, :, :, None] * axes_b[:, :, None, :], 1).reshape(-1, 9)
+    d, n = at.dimension, len(joints)
+    markers = [marker for joint in joints for marker in (joint.on_a, joint.on_b)]
+    bodies = np.array([at.row(marker.body) for marker in markers])
+    points, frames, angles = (jnp.stack(x) for x in zip(*(marker.arrays for marker in markers), strict=True))
+    # Of the axes those that are asked for, each by its marker and its column.
+    axes = sorted(
+        {(2 * k, i) for k, joint in enumerate(joints) for i in (*joint.slides, *(i for i, _ in joint.turns))}
+        | {(2 * k + 1, j) for k, joint in enumerate(joints) for _, j in joint.turns}
     )
-    every = jnp.concatenate([apart, along, turns], 1)
-    chosen = [k * every.shape[1] + i for k, joint in enumerate(joints) for i in joint.columns]
-    return at_rows(jnp.ravel(every), np.array(chosen))
+    columns = jnp.swapaxes(frames, 1, 2).reshape(-1, d)
+    arms = [points, at_rows(columns, np.array([m * d + i for m, i in axes]))] if axes else [points]
+    carriers = np.concatenate([bodies, bodies[[m for m, _ in axes]]])
+    turned = jnp.sum(at_rows(at.poses.rotation, carriers) * jnp.concatenate(arms)[:, None, :], 2)
+    ends = at_rows(at.poses.position, bodies) + turned[: 2 * n]
+    apart = ends[1::2] - ends[::2]
+    # Products of what stands in this list: the axes, and d of each joint.
+    vectors = jnp.concatenate([turned[2 * n :], apart])
+    place = {axis: k for k, axis in enumerate(axes)}
+    products = [
+        product
+        for k, joint in enumerate(joints)
+        for product in (
+            *((place[2 * k, i], len(axes) + k) for i in joint.slides),
+            *((place[2 * k, i], place[2 * k + 1, j]) for i, j in joint.turns),
+        )
+    ]
+    every = [jnp.ravel(apart)]
+    if products:
+        left, right = np.array(products).T
+        every.append(jnp.sum(at_rows(vectors, left) * at_rows(vectors, right), 1))
+    if d == 2:
+        # Axes do not show whole turns.
+        turns = at_rows(at.rows[:, 2], bodies) - angles
+        every.append(turns[1::2] - turns[::2])
+    return at_rows(jnp.concatenate(every), _order(joints))
+
+
+def _order(joints: Sequence[Joint]) -> Int[np.ndarray, " m"]:
+    """Where the equations stand in d of all joints, and then products and angles, of which joint by joint those are taken that it has."""
+    d = len(joints[0].on_a.point)
+    counts = [len(joint.slides) + len(joint.turns) for joint in joints]
+    first, found = d * len(joints), []
+    for k, (joint, count) in enumerate(zip(joints, counts, strict=True)):
+        found += [] if joint.slides or not joint.locked else [d * k + i for i in range(d)]
+        found += range(first, first + count)
+        found += [d * len(joints) + sum(counts) + k] if d == 2 and joint.perpendicular else []
+        first += count
+    return np.array(found)
 
 
 def revolute(
