@@ -59,8 +59,8 @@ def level_at_start(
     The sign is that of its rate after half the time that is `together`, from rest that of its first derivative that is not zero; the
     sign with which it came, −`before`, where its rate is not known. What a reset that has `changed` the state has brought to rest stays
     on the side `before` it, so that resets pile up where it is pulled through zero. Zero is what the condition moves by in that time,
-    what may be round-off of the state in it, the value at which it was `found` to be zero, and, where it has `moved`, what it is off
-    by: that and the error of the state.
+    what may be round-off of the state in it, the value at which it was `found` to be zero, and, where it has `moved`, that and the error
+    of the state: a reset that leaves it further off has put it there.
     """
     value = jnp.asarray(condition(t, y, args))
     # The state as it is: one made anew from the underlying ODE is NaN where the structure allows what the numbers do not.
@@ -77,10 +77,11 @@ def level_at_start(
     round_off = ROUND_OFF * jnp.finfo(t.dtype).eps * jnp.where(jnp.isfinite(terms), terms, 0)
     # Where the state had to be made consistent it is off by its error, and will be: algebraic unknowns included.
     error = error_of(condition, t, y, args, rtol, atol)
-    off = jnp.where(moved > round_off, 2 * moved + ERRORS * error, 0)
+    inexact = moved > round_off
+    off = jnp.where(inexact, 2 * moved + ERRORS * error, 0)
     # Where the condition jumps over zero, more was found.
     found = jnp.where(found <= error, found, 0)
-    zero = rate * together + round_off + 2 * found + off
+    zero = rate * together + round_off + 2 * found + jnp.where(inexact, 2 * moved + error, 0)
     leaves = jnp.abs(value) <= zero
     level = jnp.where(leaves, side * zero, value)
     # From rest the error of the first steps outruns the condition.

@@ -98,7 +98,7 @@ def Jump(
 class _Progress(NamedTuple):
     """Where a solve stands: the start of the next part, what was saved so far, `changed` of the args beside, and how the last part
     ended; `side` is the sign that the condition had in the last part, `changed_y` whether the last reset changed the state, `found` the
-    condition there, `moved` by how much making the state after that consistent has changed it.
+    condition there, `moved` by how much making the state there consistent changes it.
     """
 
     t: Float[Array, ""]
@@ -253,13 +253,16 @@ def _changes(reset: Reset, t: Time, y: State, args: Args) -> PyTree[bool]:
 
 def _after(system: System, reset: Reset, t: Time, y: State, args: Args) -> tuple[Any, Any, Scalar, Scalar, Scalar]:
     """The state and the numbers in the args after a reset; whether the state is another; the condition before it, which is zero but for
-    the resolution of time, and by how much it has moved with the state that is consistent.
+    the resolution of time, and by how much it is off with the state that was found: by so much it moves as that is made consistent. (As
+    the state after it is, the condition may come to move by more: a rod that is longer from here on has left the stop.)
     """
     wanted, new = reset.reset(t, y, args)
     consistent = consistent_state(system, t, wanted, new, fixed=reset.fixed)
     of = lambda y, args: jnp.asarray(reset.condition(t, y, args), jnp.result_type(t))
     numbers = (eqx.filter(a, _is_number) for a in (new, args))
     after = jax.tree.map(lambda x, like: jnp.asarray(x, jnp.result_type(like)), *numbers)
-    found, moved = lax.stop_gradient((jnp.abs(of(y, args)), jnp.abs(of(consistent, new) - of(wanted, new))))
+    before = of(y, args)
+    moved = of(consistent_state(system, t, y, args), args) - before
+    found, moved = lax.stop_gradient((jnp.abs(before), jnp.abs(moved)))
     other = jnp.any(jnp.stack([jnp.any(a != b) for a, b in zip(*map(jax.tree.leaves, (wanted, y)), strict=True)]))
     return consistent, after, other.astype(found.dtype), found, moved

@@ -476,3 +476,41 @@ def test_resets_of_a_large_system_know_no_unit_of_time():
     )
     assert sol.stats["jumps"] == 3
     np.testing.assert_allclose(omega * sol.stats["jump_times"][:3], np.pi * np.array([1, 3, 5]), rtol=1e-6)
+
+
+@pytest.mark.parametrize("solver", [dae_jax.OrthogonalProjection(dae_jax.DOP853()), dae_jax.RadauIIA5()])
+@pytest.mark.parametrize("direction", [None, True])
+def test_a_reset_after_which_the_consistent_state_is_far_beyond_the_stop(solver, direction):
+    """A rod on which nothing acts turns at speed 1, is sent back at x = 1/2, and is longer from there on, so that x = 0.55: it crosses
+    the stop on its way back, at φ = asin(1/2.2), where crossings both ways count.
+    """
+    rod = dae_jax.ConstrainedSystem(lambda t, q, v, r: jnp.zeros(2), lambda t, q, r: (q @ q - r**2) / 2)
+    longer = dae_jax.Reset(
+        lambda t, y, r, **_: y[0][0] - 0.5,
+        lambda t, y, r: ((y[0], -y[1]), jnp.where(r < 1.05, 1.1, r)),
+        direction,
+    )
+    start = (jnp.array([0.0, -1.0]), jnp.array([1.0, 0.0]))
+    sol = dae_jax.daesolve(rod, solver, 0.0, 0.8, None, start, 1.0, event=longer, throw=False)
+    hit, again = np.pi / 6, np.pi / 6 + 1.1 * (np.pi / 6 - np.arcsin(1 / 2.2))
+    times = [hit] if direction else [hit, again]
+    assert sol.stats["jumps"] == len(times)
+    np.testing.assert_allclose(sol.stats["jump_times"][: len(times)], times, atol=1e-7)
+    back = np.abs(0.8 - again) if not direction else again - 0.8
+    angle = np.arcsin(1 / 2.2) + back / 1.1
+    np.testing.assert_allclose(sol.ys[0][-1], 1.1 * np.array([np.sin(angle), -np.cos(angle)]), atol=1e-7)
+
+
+@pytest.mark.parametrize("solver", [dae_jax.RadauIIA5(), dae_jax.BDF()])
+def test_a_reset_that_goes_a_hundred_tolerances_beyond_the_stop(solver):
+    """A rod that turns at speed 1 is sent back at x = 1/2, from 0.01 rad beyond: it has not reached the stop from below again."""
+    turn = jnp.array([[jnp.cos(0.01), -jnp.sin(0.01)], [jnp.sin(0.01), jnp.cos(0.01)]])
+    rod = dae_jax.ConstrainedSystem(lambda t, q, v, args: jnp.zeros(2), lambda t, q, args: (q @ q - 1) / 2)
+    back = dae_jax.Reset(lambda t, y, a, **_: y[0][0] - 0.5, lambda t, y, a: ((turn @ y[0], -turn @ y[1]), a), True)
+    start = (jnp.array([0.0, -1.0]), jnp.array([1.0, 0.0]))
+    sol = dae_jax.daesolve(
+        rod, solver, 0.0, 2.0, None, start, event=back, stepsize_controller=diffrax.PIDController(rtol=1e-4, atol=1e-4)
+    )
+    assert sol.stats["jumps"] == 1
+    angle = np.pi / 3 + 0.01 - 2.0
+    np.testing.assert_allclose(sol.ys[0][-1], [np.sin(angle), -np.cos(angle)], atol=0.02)
