@@ -7,7 +7,7 @@ from pathlib import Path
 
 from dae_jax.app.options import writable
 
-from . import chain, cost, first, gpu, jit, large, stiff, sweep, timing, work_precision
+from . import chain, cost, first, gpu, jit, large, loops, stiff, sweep, timing, work_precision
 from .peers import NAMES, PACKAGES, load
 
 
@@ -20,6 +20,7 @@ PARTS = {
     "stiff": stiff,
     "jit": jit,
     "large": large,
+    "loops": loops,
     "gpu": gpu,
 }
 # The others are asked for: one needs a GPU, one takes an hour of new processes.

@@ -10,6 +10,7 @@ A peer is a module with
     sweep(angles, rtol, t1=10.0, method)     → (end states, solve)      where it takes part in the sweep
     stiff(problem, rtol, method)             → (end state, solve)       where it has `stiff_methods`, see `stiff_problems`
     large(problem, rtol, method)             → (states, steps, solve)       where it has `large_methods`, see `large_problems`
+    loops(problem, rtol, method)             → (places of bodies, solve)    where it has `loop_methods`
 The call builds and solves once; `solve()` then integrates again from the start, warm, and returns when it is done.
 The absolute tolerance equals the relative one throughout. States are as in `problems`.
 """

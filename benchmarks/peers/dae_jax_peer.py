@@ -248,3 +248,45 @@ def _large_calls(function, problem, rtol):
     if result != dae_jax.RESULTS.successful:
         raise RuntimeError("the solve failed")
     return np.asarray(end), int(steps), solve
+
+
+loop_methods = ("OrthogonalProjection(DOP853)", "OrthogonalProjection(Tsit5)")
+
+
+def loops(problem, rtol, method):
+    from benchmarks.loops import places
+
+    solve = _loops(problem, rtol, method)
+    return places(solve().ys[0].values[-1]), solve
+
+
+def long_loops(problem, rtol, t1, method=loop_methods[0]):
+    """(largest gap of a joint at 1,001 times, solve)."""
+    import dae_jax
+    from benchmarks.loops import example
+
+    times = np.linspace(0, t1, 1001)
+    found = dae_jax.drift(example(problem).system, _loops(problem, rtol, method, times)()).position
+    return float(np.max(found)), _loops(problem, rtol, method, times[-1:])
+
+
+def _loops(problem, rtol, method, times=None):
+    import diffrax
+    import jax
+
+    import dae_jax
+    from benchmarks.loops import example
+
+    jax.config.update("jax_enable_x64", True)
+    scene = example(problem)
+    explicit = {"OrthogonalProjection(DOP853)": dae_jax.DOP853(), "OrthogonalProjection(Tsit5)": diffrax.Tsit5()}
+    saved = diffrax.SaveAt(t1=True) if times is None else diffrax.SaveAt(ts=times)
+    solve = jax.jit(
+        lambda start, rtol: dae_jax.daesolve(
+            scene.system, dae_jax.OrthogonalProjection(explicit[method]), 0.0, scene.t1 if times is None else times[-1],
+            None, start, saveat=saved, max_steps=100_000,
+            stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol),
+        )
+    )  # fmt: skip
+    start, rtol = jax.tree.map(jax.numpy.asarray, (scene.y0, rtol))
+    return lambda: jax.block_until_ready(solve(start, rtol))

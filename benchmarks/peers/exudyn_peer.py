@@ -3,6 +3,8 @@
 DOPRI5 adapts its step to the tolerance. RK67 has a fixed step, 0.1 rtol^(1/7), so that its rows span the same errors.
 """
 
+import importlib
+
 import numpy as np
 
 from . import missing, problems
@@ -94,3 +96,105 @@ def _settings(rtol, t1, method):
         settings.timeIntegration.relativeTolerance = rtol
         settings.timeIntegration.absoluteTolerance = rtol
     return settings
+
+
+# Bodies in redundant coordinates, joints as constraints: its implicit integrators, of second order with a fixed step.
+loop_methods = ("TrapezoidalIndex2", "GeneralizedAlpha")
+
+
+def loops(problem, rtol, method):
+    import exudyn
+
+    from benchmarks.loops import example
+
+    scene = example(problem)
+    settings = exudyn.SimulationSettings()
+    settings.solutionSettings.writeSolutionToFile = False
+    settings.timeIntegration.verboseMode = 0
+    settings.timeIntegration.endTime = scene.t1
+    settings.timeIntegration.numberOfSteps = round(scene.t1 / (0.1 * rtol**0.5)) + 1
+    settings.timeIntegration.newton.useModifiedNewton = True
+    settings.linearSolverType = exudyn.LinearSolverType.EigenSparse
+    container = exudyn.SystemContainer()
+    system = container.AddSystem()
+    bodies = _LOOPS[problem](system, scene)
+    system.Assemble()
+
+    def solve():
+        kind = getattr(exudyn.DynamicSolverType, method)
+        if not system.SolveDynamic(settings, solverType=kind, showHints=False, showCausingItems=False):
+            raise RuntimeError("exudyn's solver failed")
+
+    solve()
+    current, place = exudyn.ConfigurationType.Current, exudyn.OutputVariableType.Position
+    d = 2 if problem == "five-bar" else 3
+    return np.stack([system.GetObjectOutputBody(body, place, [0, 0, 0], current)[:d] for body in bodies]), solve
+
+
+def _five_bar(system, scene):
+    import exudyn.itemInterface as items
+
+    m = importlib.import_module("dae_jax.mechanisms.examples.five_bar")
+    ground = system.AddObject(items.ObjectGround())
+    bodies = []
+    for mass, length, place in zip(m.MASSES, m.LENGTHS, scene.y0[0].values, strict=True):
+        node = system.AddNode(items.NodeRigidBody2D(referenceCoordinates=list(place)))
+        inertia = mass * length**2 / 12
+        body = items.ObjectRigidBody2D(nodeNumber=node, physicsMass=mass, physicsInertia=inertia)
+        bodies.append(system.AddObject(body))
+        centre = system.AddMarker(items.MarkerBodyPosition(bodyNumber=bodies[-1]))
+        system.AddLoad(items.LoadForceVector(markerNumber=centre, loadVector=[0, -9.81 * mass, 0]))
+    at = lambda body, x: system.AddMarker(items.MarkerBodyPosition(bodyNumber=body, localPosition=[x, 0, 0]))
+    left, first, second, right = bodies
+    crank, coupler = m.CRANK / 2, m.COUPLER / 2
+    for one, other in (
+        (at(ground, 0), at(left, -crank)),
+        (at(left, crank), at(first, -coupler)),
+        (at(first, coupler), at(second, coupler)),
+        (at(right, crank), at(second, -coupler)),
+        (at(ground, m.BASE), at(right, -crank)),
+    ):
+        system.AddObject(items.ObjectJointRevolute2D(markerNumbers=[one, other]))
+    turning = system.AddMarker(items.MarkerBodyRigid(bodyNumber=left))
+    system.AddLoad(items.LoadTorqueVector(markerNumber=turning, loadVector=[0, 0, m.TORQUE]))
+    return bodies
+
+
+def _stewart(system, scene):
+    from exudyn.utilities import RigidBodyInertia
+
+    m = importlib.import_module("dae_jax.mechanisms.examples.stewart")
+    ground = system.CreateGround()
+    inertias = {
+        "platform": (10.0, (0.9, 1.0, 1.7)),
+        "cylinder": (1.0, (0.02, 0.02, 0.005)),
+        "rod": (0.5, (0.01, 0.01, 0.002)),
+    }
+    found = {}
+    for name, place, velocity in zip(scene.y0[0].names, scene.y0[0].values, scene.y0[1].values, strict=True):
+        mass, inertia = inertias[name.split()[0]]
+        found[name] = system.CreateRigidBody(
+            inertia=RigidBodyInertia(mass, np.diag(inertia)), referencePosition=list(place[:3]), gravity=list(m.GRAVITY),
+            initialVelocity=list(velocity[:3]),
+            # Of a unit quaternion (1, 0, 0, 0).
+            initialAngularVelocity=list(2 * velocity[4:]),
+        )  # fmt: skip
+    for k, (foot, head, span, side) in enumerate(zip(m.FEET, m.HEADS, m.SPANS, m.SIDES, strict=True)):
+        along = span / np.linalg.norm(span)
+        across = np.cross(side, along)
+        cylinder, rod, platform = found[f"cylinder {k}"], found[f"rod {k}"], found["platform"]
+        system.CreateGenericJoint(
+            bodyNumbers=[ground, cylinder], position=list(foot), constrainedAxes=[1, 1, 1, 0, 0, 1], useGlobalFrame=True,
+            rotationMatrixAxes=np.stack([side, across, np.cross(side, across)], 1),
+        )  # fmt: skip
+        place = list(foot + 0.75 * span)
+        system.CreatePrismaticJoint(bodyNumbers=[cylinder, rod], position=place, axis=list(along), useGlobalFrame=True)
+        system.CreateSphericalJoint(bodyNumbers=[rod, platform], position=list(head))
+        system.CreateSpringDamper(
+            bodyNumbers=[ground, platform], localPosition0=list(foot), localPosition1=list(head - m.CENTRE),
+            stiffness=m.STIFFNESS, damping=0,
+        )  # fmt: skip
+    return [found[name] for name in scene.y0[0].names]
+
+
+_LOOPS = {"five-bar": _five_bar, "stewart": _stewart}

@@ -4,6 +4,10 @@ It has no tolerance: the step is 0.25 rtol^(1/4), so that the rows span the same
 inertia; 1e-14 beside the point masses is below every error in the tables.
 """
 
+import importlib
+
+import numpy as np
+
 from . import missing, problems
 
 
@@ -53,3 +57,111 @@ def _model(n, step, integrator):
         '<flag contact="disable" constraint="disable"/></option>'
         f"<worldbody>{bodies}</worldbody></mujoco>"
     )
+
+
+# Loops are closed by `connect`, as stiff as MuJoCo lets them be at each step: its error falls with the square of the step.
+loop_methods = ("RK4",)
+
+
+def loops(problem, rtol, method):
+    import mujoco
+
+    from benchmarks.loops import example
+
+    scene = example(problem)
+    steps = round(scene.t1 / (0.1 * rtol**0.5)) + 1
+    step = scene.t1 / steps
+    model = mujoco.MjModel.from_xml_string(_LOOPS[problem](step, method))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    rates = _rates(model, data)
+
+    def solve():
+        mujoco.mj_resetData(model, data)
+        data.qvel[:] = rates
+        if problem == "five-bar":
+            data.qfrc_applied[0] = _five_bar_numbers().TORQUE
+        mujoco.mj_step(model, data, nstep=steps)
+
+    solve()
+    mujoco.mj_kinematics(model, data)
+    d = 2 if problem == "five-bar" else 3
+    return np.stack([data.body(name).xipos[:d] for name in scene.y0[0].names]), solve
+
+
+def _rates(model, data):
+    """Rates of all joints that go with those of the platform: rows of the equalities times them are 0."""
+    import mujoco
+
+    rates = np.zeros(model.nv)
+    if model.nv < 6:
+        return rates
+    numbers = _stewart_numbers()
+    rates[:6] = [*numbers.VELOCITY, *numbers.SPIN]
+    rows = np.zeros((data.nefc, model.nv))
+    mujoco.mju_sparse2dense(rows, data.efc_J, data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind)
+    rates[6:] = np.linalg.lstsq(rows[:, 6:], -rows[:, :6] @ rates[:6], rcond=None)[0]
+    return rates
+
+
+def _five_bar_numbers():
+    return importlib.import_module("dae_jax.mechanisms.examples.five_bar")
+
+
+def _stewart_numbers():
+    return importlib.import_module("dae_jax.mechanisms.examples.stewart")
+
+
+def _five_bar(step, integrator):
+    m = _five_bar_numbers()
+    angles = np.asarray(m.five_bar_linkage().reference[0].values)[:, 2]
+
+    def rod(name, k, place, turn, child=""):
+        half, inertia = m.LENGTHS[k] / 2, m.MASSES[k] * m.LENGTHS[k] ** 2 / 12
+        return (
+            f'<body name="{name}" pos="{_words(place)}" euler="0 0 {turn!r}"><joint type="hinge" axis="0 0 1"/>'
+            f'<inertial pos="{half} 0 0" mass="{m.MASSES[k]}" diaginertia="{_words((inertia, inertia, inertia))}"/>{child}</body>'
+        )
+
+    left, first, second, right = (float(x) for x in angles)
+    tip = (m.CRANK, 0, 0)
+    bodies = rod("left", 0, (0, 0, 0), left, rod("left coupler", 1, tip, first - left)) + rod(
+        "right", 3, (m.BASE, 0, 0), right, rod("right coupler", 2, tip, second - right)
+    )
+    closed = f'<connect body1="left coupler" body2="right coupler" anchor="{m.COUPLER} 0 0"/>'
+    return _with_loops(step, integrator, "0 -9.81 0", bodies, closed)
+
+
+def _stewart(step, integrator):
+    m = _stewart_numbers()
+    bodies = (
+        f'<body name="platform" pos="{_words(m.CENTRE)}"><freejoint/>'
+        '<inertial pos="0 0 0" mass="10" diaginertia=".9 1 1.7"/></body>'
+    )
+    closed = ""
+    for k, (foot, head, span, side) in enumerate(zip(m.FEET, m.HEADS, m.SPANS, m.SIDES, strict=True)):
+        bodies += (
+            f'<body name="cylinder {k}" pos="{_words(foot)}"><joint axis="{_words(side)}"/>'
+            f'<joint axis="{_words(np.cross(side, span))}"/>'
+            f'<inertial pos="{_words(0.25 * span)}" mass="1" diaginertia=".02 .02 .005"/>'
+            f'<body name="rod {k}"><joint type="slide" axis="{_words(span)}" stiffness="{m.STIFFNESS}"/>'
+            f'<inertial pos="{_words(0.75 * span)}" mass=".5" diaginertia=".01 .01 .002"/></body></body>'
+        )
+        closed += f'<connect body1="platform" body2="rod {k}" anchor="{_words(head - m.CENTRE)}"/>'
+    return _with_loops(step, integrator, "0 0 -9.81", bodies, closed)
+
+
+_LOOPS = {"five-bar": _five_bar, "stewart": _stewart}
+
+
+def _with_loops(step, integrator, gravity, bodies, closed):
+    return (
+        '<mujoco><compiler angle="radian"/>'
+        f'<option integrator="{integrator}" timestep="{step!r}" gravity="{gravity}" tolerance="0" iterations="20" jacobian="sparse">'
+        f'<flag contact="disable"/></option><default><equality solref="{2 * step!r} 1" solimp="0.9999 0.9999 0.001 0.5 2"/></default>'
+        f"<worldbody>{bodies}</worldbody><equality>{closed}</equality></mujoco>"
+    )
+
+
+def _words(numbers):
+    return " ".join(repr(float(x)) for x in numbers)
