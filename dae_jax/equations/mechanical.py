@@ -271,19 +271,20 @@ class MechanicalODE(ManifoldODE):
         return q + self.linear.lift(self, normals, mu[:m]), v + self.linear.lift(self, normals, mu[m:])
 
     def retract_along(self, t: Time, y: Phase, normals: Normals) -> tuple[Any, Bool[Array, ""]]:
-        q, _ = y
-        zero = jnp.zeros(2 * self.holonomic + self.nonholonomic, q.dtype)
-        return self._restored(t, y, normals, self.correction(t, y, normals, zero))
+        return self._restored(t, y, normals, self._first_correction(t, y, normals))
 
     def project(self, t: Time, y: Phase) -> tuple[Any, Bool[Array, ""]]:
-        normals, *first = self._first_correction(t, y)
+        normals, *first = self._along_its_own_normals(t, y)
         return self._restored(t, y, normals, first)
 
     @at_one_instant
-    def _first_correction(self, t: Time, y: Phase) -> tuple[Any, Float[Array, " c"], Float[Array, ""]]:
+    def _along_its_own_normals(self, t: Time, y: Phase) -> tuple[Any, Float[Array, " c"], Float[Array, ""]]:
         normals = self.normals(t, y)
-        zero = jnp.zeros(2 * self.holonomic + self.nonholonomic, y[0].dtype)
-        return normals, *self.correction(t, y, normals, zero)
+        return normals, *self._corrected(t, y, normals, normals)
+
+    @at_one_instant
+    def _first_correction(self, t: Time, y: Phase, normals: Normals) -> tuple[Float[Array, " c"], Any]:
+        return self._corrected(t, y, normals, self.normals(t, y))
 
     def _restored(self, t: Time, y: Phase, normals: Normals, first: Sequence[Array]) -> tuple[Any, Bool[Array, ""]]:
         def iterate(params: PyTree) -> tuple[Float[Array, " c"], Bool[Array, ""]]:
@@ -310,15 +311,21 @@ class MechanicalODE(ManifoldODE):
         The matrix is A M⁻¹Aᵀ at the current point, which differs from the Jacobian A N by the square of the angle
         between the two normal spaces and stays symmetric.
         """
-        q, v = self.displace(y, normals, mu)
-        here = self.normals(t, (q, v))
+        here = self.displace(y, normals, mu)
+        change, size = self._corrected(t, here, normals, self.normals(t, here))
+        return mu + change, size
+
+    @at_one_instant
+    def _corrected(self, t: Time, y: Phase, normals: Normals, here: Normals) -> tuple[Float[Array, " c"], Any]:
+        """The correction of μ at a point y whose normals are `here`, and its size."""
+        q, v = y
         dq, delta = jnp.zeros_like(q), jnp.zeros(0, q.dtype)
         if self.holonomic:
             delta = self.linear.gram_solve(self, here, self.constraint(t, q))
             dq = self.linear.lift(self, normals, delta)
         kappa = self.linear.gram_solve(self, here, self.velocity_constraint(t, q - dq, v))
         sizes = relative_change(dq, q), relative_change(self.linear.lift(self, normals, kappa), v)
-        return mu - jnp.concatenate([delta, kappa]), jnp.maximum(*sizes)
+        return -jnp.concatenate([delta, kappa]), jnp.maximum(*sizes)
 
 
 def _manifold_residual(mu: Float[Array, " c"], params: PyTree) -> Float[Array, " c"]:
