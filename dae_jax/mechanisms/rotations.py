@@ -18,22 +18,10 @@ _SIGNS = np.array([[-1, 1, 1, -1], [-1, -1, 1, 1], [-1, 1, -1, 1]])
 _SIGNS_PLUS = np.array([[-1, 1, -1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1]])
 
 
-@jax.custom_jvp
 def matrix(e: Float[Array, "4"]) -> Float[Array, "3 3"]:
     """R(e) = E₊ Eᵀ, homogeneous of degree 2 in e: a rotation where |e| = 1 (Nikravesh, eq. 6.19)."""
-    return _bilinear(e, e)
-
-
-@matrix.defjvp
-def _matrix_derivative(at: tuple[Float[Array, "4"]], along: tuple[Float[Array, "4"]]) -> tuple[Array, Array]:
-    """E₊(a) E(b)ᵀ is symmetric in a and b, as vec(a p b̄) is: half of what the rule of products would take."""
-    (e,), (de,) = at, along
-    return matrix(e), 2 * _bilinear(e, de)
-
-
-def _bilinear(a: Float[Array, "4"], b: Float[Array, "4"]) -> Float[Array, "3 3"]:
-    """E₊(a) E(b)ᵀ."""
-    plus, minus = _entries(a) * _SIGNS_PLUS.astype(a.dtype), _entries(b) * _SIGNS.astype(b.dtype)
+    entries = _entries(e)
+    plus, minus = (entries * signs.astype(e.dtype) for signs in (_SIGNS_PLUS, _SIGNS))
     return jnp.sum(plus[:, None, :] * minus, 2)
 
 
