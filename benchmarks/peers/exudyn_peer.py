@@ -1,6 +1,7 @@
 """Exudyn: minimal coordinates (ObjectKinematicTree), explicit Runge-Kutta, its own time loop in C++.
 
-DOPRI5 adapts its step to the tolerance. RK67 has a fixed step, 0.1 rtol^(1/7), so that its rows span the same errors.
+DOPRI5 adapts its step to the tolerance. RK67 has a fixed step, 0.1 rtol^(1/7), so that its rows span the same errors. Closed loops:
+bodies in redundant coordinates and joints, its implicit integrators with steps of 0.1 rtol^(1/2).
 """
 
 import importlib
@@ -98,7 +99,6 @@ def _settings(rtol, t1, method):
     return settings
 
 
-# Bodies in redundant coordinates, joints as constraints: its implicit integrators, of second order with a fixed step.
 loop_methods = ("TrapezoidalIndex2", "GeneralizedAlpha")
 
 
