@@ -90,37 +90,38 @@ def pairs(joints: Sequence[Joint], at: Configuration) -> Float[Array, " m"]:
     markers = [marker for joint in joints for marker in (joint.on_a, joint.on_b)]
     bodies = np.array([at.row(marker.body) for marker in markers])
     points, frames, angles = (jnp.stack(x) for x in zip(*(marker.arrays for marker in markers), strict=True))
-    # Of the axes those that are asked for, each by its marker and its column.
-    axes = sorted(
-        {(2 * k, i) for k, joint in enumerate(joints) for i in (*joint.slides, *(i for i, _ in joint.turns))}
-        | {(2 * k + 1, j) for k, joint in enumerate(joints) for _, j in joint.turns}
-    )
+    axes, left, right = _products(joints)
     columns = jnp.swapaxes(frames, 1, 2).reshape(-1, d)
     arms = [points, at_rows(columns, np.array([m * d + i for m, i in axes]))] if axes else [points]
     carriers = np.concatenate([bodies, bodies[[m for m, _ in axes]]])
     turned = jnp.sum(at_rows(at.poses.rotation, carriers) * jnp.concatenate(arms)[:, None, :], 2)
     ends = at_rows(at.poses.position, bodies) + turned[: 2 * n]
     apart = ends[1::2] - ends[::2]
-    # Products of what stands in this list: the axes, and d of each joint.
-    vectors = jnp.concatenate([turned[2 * n :], apart])
-    place = {axis: k for k, axis in enumerate(axes)}
-    products = [
-        product
-        for k, joint in enumerate(joints)
-        for product in (
-            *((place[2 * k, i], len(axes) + k) for i in joint.slides),
-            *((place[2 * k, i], place[2 * k + 1, j]) for i, j in joint.turns),
-        )
-    ]
     every = [jnp.ravel(apart)]
-    if products:
-        left, right = np.array(products).T
+    if axes:
+        vectors = jnp.concatenate([turned[2 * n :], apart])
         every.append(jnp.sum(at_rows(vectors, left) * at_rows(vectors, right), 1))
     if d == 2:
         # Axes do not show whole turns.
         turns = at_rows(at.rows[:, 2], bodies) - angles
         every.append(turns[1::2] - turns[::2])
     return at_rows(jnp.concatenate(every), _order(joints))
+
+
+def _products(joints: Sequence[Joint]) -> tuple[list[tuple[int, int]], Int[np.ndarray, " p"], Int[np.ndarray, " p"]]:
+    """The axes that the equations ask for, each by its marker and its column; and of which two vectors their products are, in a list
+    of these axes and d of each joint.
+    """
+    asked = [
+        ((2 * k, i), other)
+        for k, joint in enumerate(joints)
+        for i, other in (*((i, None) for i in joint.slides), *((i, (2 * k + 1, j)) for i, j in joint.turns))
+    ]
+    axes = sorted({axis for pair in asked for axis in pair if axis is not None})
+    place = {axis: k for k, axis in enumerate(axes)}
+    left = np.array([place[a] for a, _ in asked], int)
+    right = np.array([len(axes) + a[0] // 2 if b is None else place[b] for a, b in asked], int)
+    return axes, left, right
 
 
 def _order(joints: Sequence[Joint]) -> Int[np.ndarray, " m"]:
