@@ -1,6 +1,7 @@
 """The ready mechanisms, against minimal coordinates, and by what they keep."""
 
 import diffrax
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -56,6 +57,13 @@ def test_a_reference_starts_where_the_mechanism_is_assembled(name: str):
     at, moving = mechanism.assemble(({body: q[body] for body in q.names}, {body: v[body] for body in v.names}))
     assert np.allclose(at.values, q.values, rtol=0, atol=1e-12)
     assert np.allclose(moving.values, v.values, rtol=0, atol=1e-12 * np.abs(v.values).max())
+
+
+@pytest.mark.parametrize("name", ["delta", "rolling-disc", "stewart"])
+def test_a_start_is_exact_whatever_floats_jax_is_set_to(name: str):
+    with jax.enable_x64(False):
+        q, _ = m.EXAMPLES[name]().y0
+    assert np.allclose(np.linalg.norm(q.values[:, 3:], axis=1), 1, rtol=0, atol=1e-15)
 
 
 def test_a_wheel_is_drawn_as_its_rim():

@@ -15,14 +15,14 @@ RADIUS, MASS, GRAVITY = 0.3, 2.0, np.array([0.0, 0.0, -9.81])
 INERTIA = MASS * RADIUS**2 * np.array([0.25, 0.25, 0.5])
 # Its axis leans from the horizontal; it rolls ahead, along x, and turns.
 LEAN, SPIN = 0.3, np.array([0.1, 5.0, 0.8])
+TURN = turn((1, 0, 0), np.asarray(LEAN - np.pi / 2))
 
 
 def rolling_disc() -> Mechanism:
     """A thin disc on its edge on a plane that is level: one equation of positions, two of velocities, which are not holonomic."""
-    e = turn((1, 0, 0), np.asarray(LEAN - np.pi / 2))
-    axis = rotated(e, np.array([0.0, 0.0, 1.0]))
+    axis = _axis(TURN)
     arm = _contact(axis)
-    disc = Body("disc", MASS, INERTIA, at=-arm, orientation=e, velocity=-np.cross(SPIN, arm), spin=SPIN)
+    disc = Body("disc", MASS, INERTIA, at=-arm, orientation=TURN, velocity=-np.cross(SPIN, arm), spin=SPIN)
     rolls = rolling(ground, disc, radius=RADIUS, at=(0, 0, 0), normal=(0, 0, 1), axis=axis, name="ground")
     return Mechanism([disc], [rolls], [gravity(GRAVITY)])
 
@@ -35,7 +35,6 @@ def disc() -> Scene[ConstrainedSystem]:
     for the plane's normal n and the disc's axis u: three equations for ω̇, without multipliers.
     """
     mechanism = rolling_disc()
-    q0, _ = (np.asarray(x.values)[0] for x in mechanism.reference)
 
     def field(t: float, state: np.ndarray) -> np.ndarray:
         e, spin = state[3:7], state[7:]
@@ -49,12 +48,18 @@ def disc() -> Scene[ConstrainedSystem]:
 
     def embed(t: float, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         place, e, spin = state[:3], state[3:7], state[7:]
-        arm = _contact(rotated(e, np.array([0.0, 0.0, 1.0])))
+        arm = _contact(_axis(e))
         velocity = np.concatenate([-np.cross(spin, arm), _quaternion_rate(e, spin)])
         return np.concatenate([place, e])[None], velocity[None]
 
-    reference = named(mechanism.bodies, minimal(field, np.concatenate([q0, SPIN]), embed))
+    start = np.concatenate([-_contact(_axis(TURN)), TURN, SPIN])
+    reference = named(mechanism.bodies, minimal(field, start, embed))
     return Scene("rolling-disc", mechanism.system(), at_start(reference), 3.0, reference, drawing=mechanism.drawing())
+
+
+def _axis(e: np.ndarray) -> np.ndarray:
+    """u."""
+    return rotated(e, np.array([0.0, 0.0, 1.0]))
 
 
 def _contact(axis: np.ndarray) -> np.ndarray:
