@@ -271,20 +271,11 @@ class MechanicalODE(ManifoldODE):
         return q + self.linear.lift(self, normals, mu[:m]), v + self.linear.lift(self, normals, mu[m:])
 
     def retract_along(self, t: Time, y: Phase, normals: Normals) -> tuple[Any, Bool[Array, ""]]:
-        return self._restored(t, y, normals, self._first_correction(t, y, normals))
+        return self._restored(t, y, normals, self._corrected(t, y, normals, self.normals(t, y)))
 
     def project(self, t: Time, y: Phase) -> tuple[Any, Bool[Array, ""]]:
-        normals, *first = self._along_its_own_normals(t, y)
-        return self._restored(t, y, normals, first)
-
-    @at_one_instant
-    def _along_its_own_normals(self, t: Time, y: Phase) -> tuple[Any, Float[Array, " c"], Float[Array, ""]]:
         normals = self.normals(t, y)
-        return normals, *self._corrected(t, y, normals, normals)
-
-    @at_one_instant
-    def _first_correction(self, t: Time, y: Phase, normals: Normals) -> tuple[Float[Array, " c"], Any]:
-        return self._corrected(t, y, normals, self.normals(t, y))
+        return self._restored(t, y, normals, self._corrected(t, y, normals, normals))
 
     def _restored(self, t: Time, y: Phase, normals: Normals, first: Sequence[Array]) -> tuple[Any, Bool[Array, ""]]:
         def iterate(params: PyTree) -> tuple[Float[Array, " c"], Bool[Array, ""]]:
