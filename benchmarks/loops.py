@@ -9,7 +9,7 @@ import functools
 import numpy as np
 
 from . import timing
-from .work_precision import curves, time_at, timed
+from .work_precision import curves, fastest, ratio, timed
 
 
 PROBLEMS = ("five-bar", "stewart")
@@ -23,8 +23,9 @@ GAP = 1e-10
 
 def run(peers, repeats, quick):
     """One row for each problem, peer, method and tolerance; then gap and pace of six loops in 100 s by this library."""
-    rows, tired = [], set()
+    rows = []
     for problem in PROBLEMS:
+        tired = set()
         scene = example(problem)
         exact = places(scene.reference(np.array([scene.t1]))[0].values[0])
         for rtol in QUICK_RTOLS if quick else RTOLS:
@@ -32,14 +33,13 @@ def run(peers, repeats, quick):
                 (peer.name, method): functools.partial(peer.loops, problem, rtol, method=method)
                 for peer in peers
                 for method in getattr(peer, "loop_methods", ())
-                if (problem, peer.name, method) not in tired
+                if (peer.name, method) not in tired
             }
-            rows += timed(problem, rtol, calls, lambda end, exact=exact: float(np.abs(end - exact).max()), repeats)
-            tired |= {
-                (row["problem"], row["peer"], row["method"])
-                for row in rows
-                if "time" in row and row["time"].median > LONG
-            }
+            # Of what moves in a plane, peers may give a third coordinate.
+            off = lambda places, exact=exact: float(np.abs(places[:, : exact.shape[1]] - exact).max())
+            found = timed(problem, rtol, calls, off, repeats)
+            tired |= {(row["peer"], row["method"]) for row in found if "time" in row and row["time"].median > LONG}
+            rows += found
     return rows + [long(peer, repeats) for peer in peers if hasattr(peer, "long_loops") and not quick]
 
 
@@ -80,15 +80,11 @@ def figures(rows):
 def targets(rows):
     """See `work_precision.targets`."""
     for problem in PROBLEMS:
-        found = curves([row for row in rows if row["problem"] != "long"], problem)
-        best = lambda name, error, found=found: min(
-            (t for (peer, _), c in found.items() if peer == name and (t := time_at(c, error))), default=None
-        )
+        best = functools.partial(fastest, curves(rows, problem))
         for name in ("MuJoCo", "Exudyn"):
             for error in (1e-5, 1e-7):
-                ours, theirs = best("dae_jax", error), best(name, error)
-                ratio = theirs / ours if ours and theirs else None
-                yield f"{problem}: faster than {name} at {error:g} m ≥ 20", ratio, 20
+                times = ratio(best(name, error), best("dae_jax", error))
+                yield f"{problem}: faster than {name} at {error:g} m ≥ 20", times, 20
     for row in rows:
         if row["problem"] == "long":
             yield f"six loops: gap in m after {row['t1']:g} s ≤ {GAP:g}", row["gap"], GAP

@@ -6,7 +6,7 @@ import numpy as np
 
 from . import timing
 from .peers import stiff_problems
-from .work_precision import curves, time_at, timed
+from .work_precision import curves, fastest, ratio, timed
 
 
 RTOLS = tuple(10.0**-k for k in range(4, 11))
@@ -52,20 +52,12 @@ def figures(rows):
 def targets(rows):
     """(what, measured ratio, limit): this library against each peer at an error of 1e-6."""
     for problem in stiff_problems.PROBLEMS:
-        found = curves(rows, problem)
-        best = lambda name, found=found: min(
-            (t for (peer, _), c in found.items() if peer == name and (t := time_at(c, 1e-6))), default=None
-        )
-        ours = best("dae_jax")
-        ratio = lambda name, ours=ours, best=best: None if not ours or not best(name) else best(name) / ours
-        yield f"{problem}: faster than IDA with Python ≥ 20", ratio("IDA (scikit-sundae)"), 20
-        yield f"{problem}: faster than solve_dae ≥ 20", ratio("solve_dae"), 20
+        best = functools.partial(fastest, curves(rows, problem), error=1e-6)
+        slower = lambda name, best=best: ratio(best(name), best("dae_jax"))
+        yield f"{problem}: faster than IDA with Python ≥ 20", slower("IDA (scikit-sundae)"), 20
+        yield f"{problem}: faster than solve_dae ≥ 20", slower("solve_dae"), 20
         if stiff_problems.PROBLEMS[problem]().semi_explicit:
-            yield f"{problem}: faster than CasADi IDAS ≥ 1", ratio("CasADi"), 1
+            yield f"{problem}: faster than CasADi IDAS ≥ 1", slower("CasADi"), 1
     seconds = {row["peer"]: row["time"].median for row in rows if row["problem"] == "variations"}
-    both = "CasADi" in seconds and "dae_jax" in seconds
-    yield (
-        "variations: throughput of a loop over IDAS ≥ 10",
-        seconds["CasADi"] / seconds["dae_jax"] if both else None,
-        10,
-    )
+    ours, theirs = seconds.get("dae_jax"), seconds.get("CasADi")
+    yield "variations: throughput of a loop over IDAS ≥ 10", ratio(theirs, ours), 10

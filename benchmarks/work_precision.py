@@ -93,6 +93,17 @@ def time_at(curve, error):
     return float(np.exp(logs[1][after - 1] + weight * (logs[1][after] - logs[1][after - 1])))
 
 
+def fastest(found, name, error, only=""):
+    """The least `time_at` of a peer's methods, of those with `only` in their names, of `curves`."""
+    times = (time_at(curve, error) for (peer, method), curve in found.items() if peer == name and only in method)
+    return min(filter(None, times), default=None)
+
+
+def ratio(a, b):
+    """a/b of run times, where both are known."""
+    return None if a is None or b is None else a / b
+
+
 def figures(rows):
     """(name, figure) for each problem."""
     from dae_jax import plotting
@@ -106,9 +117,7 @@ def figures(rows):
 def targets(rows):
     """(what, measured ratio, limit) with "≥" or "≤" in what: this library against each peer at equal error."""
     found = curves(rows, "double pendulum")
-    best = lambda name, error, only="": min(
-        (t for (peer, m), c in found.items() if peer == name and only in m and (t := time_at(c, error))), default=None
-    )
+    best = functools.partial(fastest, found)
     for name, limit, errors in (
         ("diffrax, hand-reduced", 20, (1e-6, 1e-9)),
         ("CasADi", 20, (1e-6,)),
@@ -116,17 +125,13 @@ def targets(rows):
         ("IDA (scikit-sundae)", 200, (1e-6,)),
     ):
         for error in errors:
-            yield f"faster than {name} at {error:g} ≥ {limit}", _ratio(best(name, error), best("dae_jax", error)), limit
+            yield f"faster than {name} at {error:g} ≥ {limit}", ratio(best(name, error), best("dae_jax", error)), limit
     for error in (1e-6, 1e-9):
         ours = best("dae_jax", error, "OrthogonalProjection")
-        yield f"time of the C program at {error:g} ≤ 1.5", _ratio(ours, best("C DOP853", error, "projected")), 1.5
-        yield f"time of heyoka at {error:g} ≤ 1.5", _ratio(best("dae_jax", error), best("heyoka", error)), 1.5
+        yield f"time of the C program at {error:g} ≤ 1.5", ratio(ours, best("C DOP853", error, "projected")), 1.5
+        yield f"time of heyoka at {error:g} ≤ 1.5", ratio(best("dae_jax", error), best("heyoka", error)), 1.5
         projected, unprojected = (
             time_at(found[key], error) if (key := ("dae_jax", method)) in found else None
             for method in ("OrthogonalProjection(DOP853)", "DOP853")
         )
-        yield f"projected against unprojected at {error:g} ≤ 1.0", _ratio(projected, unprojected), 1.0
-
-
-def _ratio(a, b):
-    return None if a is None or b is None else a / b
+        yield f"projected against unprojected at {error:g} ≤ 1.0", ratio(projected, unprojected), 1.0

@@ -67,22 +67,32 @@ def solution(scene, t1, method):
 
     import dae_jax
 
-    solver, formulation = {
-        "OrthogonalProjection(DOP853)": (dae_jax.OrthogonalProjection(dae_jax.DOP853()), None),
-        "DOP853": (dae_jax.DOP853(), None),
-        "OrthogonalProjection(Tsit5)": (dae_jax.OrthogonalProjection(diffrax.Tsit5()), None),
-        "TangentSpace(DOP853)": (dae_jax.TangentSpace(dae_jax.DOP853()), None),
-        "StateSpace": (dae_jax.DOP853(), dae_jax.StateSpace(scene.chart) if scene.chart else None),
-    }[method]
+    formulation = dae_jax.StateSpace(scene.chart) if method == "StateSpace" else None
 
     def solve(start, rtol, **options):
         return dae_jax.daesolve(
-            scene.system, solver, 0.0, t1, None, tuple(jnp.split(start, 2)), scene.args, formulation=formulation,
+            scene.system, _solver(method), 0.0, t1, None, tuple(jnp.split(start, 2)), scene.args, formulation=formulation,
             stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol), throw=False,
             **{"max_steps": 100_000, **options},
         )  # fmt: skip
 
     return solve
+
+
+def _solver(method):
+    import diffrax
+
+    import dae_jax
+
+    return {
+        "OrthogonalProjection(DOP853)": dae_jax.OrthogonalProjection(dae_jax.DOP853()),
+        "OrthogonalProjection(Tsit5)": dae_jax.OrthogonalProjection(diffrax.Tsit5()),
+        "TangentSpace(DOP853)": dae_jax.TangentSpace(dae_jax.DOP853()),
+        "DOP853": dae_jax.DOP853(),
+        "StateSpace": dae_jax.DOP853(),
+        "RadauIIA5": dae_jax.RadauIIA5(),
+        "BDF": dae_jax.BDF(),
+    }[method]
 
 
 @functools.cache
@@ -133,17 +143,12 @@ def _stiff(make, method):
 
     jax.config.update("jax_enable_x64", True)
     scene = make()
-    solver = {
-        "RadauIIA5": dae_jax.RadauIIA5(),
-        "BDF": dae_jax.BDF(),
-        "OrthogonalProjection(DOP853)": dae_jax.OrthogonalProjection(dae_jax.DOP853()),
-    }[method]
     if scene.stiff and method.startswith("Orthogonal"):
         raise ValueError("an explicit method on a stiff problem")
 
     def end(start, rtol):
         sol = dae_jax.daesolve(
-            scene.system, solver, 0.0, scene.t1, None, start, max_steps=1_000_000, throw=False,
+            scene.system, _solver(method), 0.0, scene.t1, None, start, max_steps=1_000_000, throw=False,
             stepsize_controller=diffrax.PIDController(rtol=rtol, atol=scene.scale * rtol),
         )  # fmt: skip
         return jnp.concatenate([x[-1] for x in jax.tree.leaves(sol.ys)]), sol.result
@@ -229,7 +234,7 @@ def _large(problem, start, args, rtol, method, times):
 
     scene = problem.scene
     return dae_jax.daesolve(
-        scene.system, getattr(dae_jax, method)(), problem.t0, scene.t1, None, start, args, max_steps=1_000_000, throw=False,
+        scene.system, _solver(method), problem.t0, scene.t1, None, start, args, max_steps=1_000_000, throw=False,
         stepsize_controller=diffrax.PIDController(rtol=rtol, atol=scene.scale * rtol), saveat=diffrax.SaveAt(ts=times),
     )  # fmt: skip
 
@@ -277,15 +282,12 @@ def _loops(problem, rtol, method, times=None):
     import dae_jax
     from benchmarks.loops import example
 
-    jax.config.update("jax_enable_x64", True)
     scene = example(problem)
-    explicit = {"OrthogonalProjection(DOP853)": dae_jax.DOP853(), "OrthogonalProjection(Tsit5)": diffrax.Tsit5()}
-    saved = diffrax.SaveAt(t1=True) if times is None else diffrax.SaveAt(ts=times)
+    times = np.array([scene.t1]) if times is None else times
     solve = jax.jit(
         lambda start, rtol: dae_jax.daesolve(
-            scene.system, dae_jax.OrthogonalProjection(explicit[method]), 0.0, scene.t1 if times is None else times[-1],
-            None, start, saveat=saved, max_steps=100_000,
-            stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol),
+            scene.system, _solver(method), 0.0, times[-1], None, start, saveat=diffrax.SaveAt(ts=times),
+            max_steps=100_000, stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol),
         )
     )  # fmt: skip
     start, rtol = jax.tree.map(jax.numpy.asarray, (scene.y0, rtol))

@@ -13,6 +13,9 @@ from . import missing, problems
 
 name = "Exudyn"
 methods = ("DOPRI5", "RK67")
+loop_methods = ("TrapezoidalIndex2", "GeneralizedAlpha")
+# Of the methods with fixed steps, of 0.1 rtol^(1/order).
+ORDERS = {"RK67": 7, "TrapezoidalIndex2": 2, "GeneralizedAlpha": 2}
 
 
 def available():
@@ -87,8 +90,8 @@ def _settings(rtol, t1, method):
     settings.solutionSettings.writeSolutionToFile = False
     settings.timeIntegration.verboseMode = 0
     settings.timeIntegration.endTime = t1
-    if method == "RK67":
-        settings.timeIntegration.numberOfSteps = round(t1 / (0.1 * rtol ** (1 / 7))) + 1
+    if method in ORDERS:
+        settings.timeIntegration.numberOfSteps = round(t1 / (0.1 * rtol ** (1 / ORDERS[method]))) + 1
     else:
         settings.timeIntegration.numberOfSteps = 1  # the largest step it may take is t1 / numberOfSteps
         settings.timeIntegration.automaticStepSize = True
@@ -99,20 +102,13 @@ def _settings(rtol, t1, method):
     return settings
 
 
-loop_methods = ("TrapezoidalIndex2", "GeneralizedAlpha")
-
-
 def loops(problem, rtol, method):
     import exudyn
 
     from benchmarks.loops import example
 
     scene = example(problem)
-    settings = exudyn.SimulationSettings()
-    settings.solutionSettings.writeSolutionToFile = False
-    settings.timeIntegration.verboseMode = 0
-    settings.timeIntegration.endTime = scene.t1
-    settings.timeIntegration.numberOfSteps = round(scene.t1 / (0.1 * rtol**0.5)) + 1
+    settings = _settings(rtol, scene.t1, method)
     settings.timeIntegration.newton.useModifiedNewton = True
     settings.linearSolverType = exudyn.LinearSolverType.EigenSparse
     container = exudyn.SystemContainer()
@@ -127,8 +123,7 @@ def loops(problem, rtol, method):
 
     solve()
     current, place = exudyn.ConfigurationType.Current, exudyn.OutputVariableType.Position
-    d = 2 if problem == "five-bar" else 3
-    return np.stack([system.GetObjectOutputBody(body, place, [0, 0, 0], current)[:d] for body in bodies]), solve
+    return np.stack([system.GetObjectOutputBody(body, place, [0, 0, 0], current) for body in bodies]), solve
 
 
 def _five_bar(system, scene):
@@ -137,13 +132,13 @@ def _five_bar(system, scene):
     m = importlib.import_module("dae_jax.mechanisms.examples.five_bar")
     ground = system.AddObject(items.ObjectGround())
     bodies = []
-    for mass, length, place in zip(m.MASSES, m.LENGTHS, scene.y0[0].values, strict=True):
+    for body, place in zip(m.five_bar_linkage().bodies, scene.y0[0].values, strict=True):
+        mass, inertia = float(body.mass), float(body.inertia)
         node = system.AddNode(items.NodeRigidBody2D(referenceCoordinates=list(place)))
-        inertia = mass * length**2 / 12
-        body = items.ObjectRigidBody2D(nodeNumber=node, physicsMass=mass, physicsInertia=inertia)
-        bodies.append(system.AddObject(body))
+        rigid = items.ObjectRigidBody2D(nodeNumber=node, physicsMass=mass, physicsInertia=inertia)
+        bodies.append(system.AddObject(rigid))
         centre = system.AddMarker(items.MarkerBodyPosition(bodyNumber=bodies[-1]))
-        system.AddLoad(items.LoadForceVector(markerNumber=centre, loadVector=[0, -9.81 * mass, 0]))
+        system.AddLoad(items.LoadForceVector(markerNumber=centre, loadVector=[mass * g for g in (*m.GRAVITY, 0)]))
     at = lambda body, x: system.AddMarker(items.MarkerBodyPosition(bodyNumber=body, localPosition=[x, 0, 0]))
     left, first, second, right = bodies
     crank, coupler = m.CRANK / 2, m.COUPLER / 2
@@ -165,16 +160,11 @@ def _stewart(system, scene):
 
     m = importlib.import_module("dae_jax.mechanisms.examples.stewart")
     ground = system.CreateGround()
-    inertias = {
-        "platform": (10.0, (0.9, 1.0, 1.7)),
-        "cylinder": (1.0, (0.02, 0.02, 0.005)),
-        "rod": (0.5, (0.01, 0.01, 0.002)),
-    }
     found = {}
-    for name, place, velocity in zip(scene.y0[0].names, scene.y0[0].values, scene.y0[1].values, strict=True):
-        mass, inertia = inertias[name.split()[0]]
-        found[name] = system.CreateRigidBody(
-            inertia=RigidBodyInertia(mass, np.diag(inertia)), referencePosition=list(place[:3]), gravity=list(m.GRAVITY),
+    for body, place, velocity in zip(m.stewart_platform().bodies, *(x.values for x in scene.y0), strict=True):
+        found[body.name] = system.CreateRigidBody(
+            inertia=RigidBodyInertia(float(body.mass), np.asarray(body.inertia)), referencePosition=list(place[:3]),
+            gravity=list(m.GRAVITY),
             initialVelocity=list(velocity[:3]),
             # Of a unit quaternion (1, 0, 0, 0).
             initialAngularVelocity=list(2 * velocity[4:]),
@@ -194,7 +184,7 @@ def _stewart(system, scene):
             bodyNumbers=[ground, platform], localPosition0=list(foot), localPosition1=list(head - m.CENTRE),
             stiffness=m.STIFFNESS, damping=0,
         )  # fmt: skip
-    return [found[name] for name in scene.y0[0].names]
+    return list(found.values())
 
 
 _LOOPS = {"five-bar": _five_bar, "stewart": _stewart}

@@ -85,8 +85,7 @@ def loops(problem, rtol, method):
 
     solve()
     mujoco.mj_kinematics(model, data)
-    d = 2 if problem == "five-bar" else 3
-    return np.stack([data.body(name).xipos[:d] for name in scene.y0[0].names]), solve
+    return np.stack([data.body(name).xipos for name in scene.y0[0].names]), solve
 
 
 def _rates(model, data):
@@ -114,38 +113,34 @@ def _stewart_numbers():
 
 def _five_bar(step, integrator):
     m = _five_bar_numbers()
-    angles = np.asarray(m.five_bar_linkage().reference[0].values)[:, 2]
 
-    def rod(name, k, place, turn, child=""):
-        half, inertia = m.LENGTHS[k] / 2, m.MASSES[k] * m.LENGTHS[k] ** 2 / 12
+    def rod(body, length, place, turn, child=""):
         return (
-            f'<body name="{name}" pos="{_words(place)}" euler="0 0 {turn!r}"><joint type="hinge" axis="0 0 1"/>'
-            f'<inertial pos="{half} 0 0" mass="{m.MASSES[k]}" diaginertia="{_words((inertia, inertia, inertia))}"/>{child}</body>'
+            f'<body name="{body.name}" pos="{_words(place)}" euler="0 0 {turn!r}"><joint type="hinge" axis="0 0 1"/>'
+            f"{_inertial(body, (length / 2, 0, 0))}{child}</body>"
         )
 
-    left, first, second, right = (float(x) for x in angles)
+    left, first, second, right = m.five_bar_linkage().bodies
+    turn = lambda body, carrier=None: float(body.orientation) - (float(carrier.orientation) if carrier else 0.0)
     tip = (m.CRANK, 0, 0)
-    bodies = rod("left", 0, (0, 0, 0), left, rod("left coupler", 1, tip, first - left)) + rod(
-        "right", 3, (m.BASE, 0, 0), right, rod("right coupler", 2, tip, second - right)
-    )
+    bodies = rod(left, m.CRANK, (0, 0, 0), turn(left), rod(first, m.COUPLER, tip, turn(first, left)))
+    bodies += rod(right, m.CRANK, (m.BASE, 0, 0), turn(right), rod(second, m.COUPLER, tip, turn(second, right)))
     closed = f'<connect body1="left coupler" body2="right coupler" anchor="{m.COUPLER} 0 0"/>'
     return _with_loops(step, integrator, "0 -9.81 0", bodies, closed)
 
 
 def _stewart(step, integrator):
     m = _stewart_numbers()
-    bodies = (
-        f'<body name="platform" pos="{_words(m.CENTRE)}"><freejoint/>'
-        '<inertial pos="0 0 0" mass="10" diaginertia=".9 1 1.7"/></body>'
-    )
+    of = {body.name: body for body in m.stewart_platform().bodies}
+    bodies = f'<body name="platform" pos="{_words(m.CENTRE)}"><freejoint/>{_inertial(of["platform"], (0, 0, 0))}</body>'
     closed = ""
     for k, (foot, head, span, side) in enumerate(zip(m.FEET, m.HEADS, m.SPANS, m.SIDES, strict=True)):
         bodies += (
             f'<body name="cylinder {k}" pos="{_words(foot)}"><joint axis="{_words(side)}"/>'
             f'<joint axis="{_words(np.cross(side, span))}"/>'
-            f'<inertial pos="{_words(0.25 * span)}" mass="1" diaginertia=".02 .02 .005"/>'
+            f"{_inertial(of[f'cylinder {k}'], 0.25 * span)}"
             f'<body name="rod {k}"><joint type="slide" axis="{_words(span)}" stiffness="{m.STIFFNESS}"/>'
-            f'<inertial pos="{_words(0.75 * span)}" mass=".5" diaginertia=".01 .01 .002"/></body></body>'
+            f"{_inertial(of[f'rod {k}'], 0.75 * span)}</body></body>"
         )
         closed += f'<connect body1="platform" body2="rod {k}" anchor="{_words(head - m.CENTRE)}"/>'
     return _with_loops(step, integrator, "0 0 -9.81", bodies, closed)
@@ -161,6 +156,12 @@ def _with_loops(step, integrator, gravity, bodies, closed):
         f'<flag contact="disable"/></option><default><equality solref="{2 * step!r} 1" solimp="0.9999 0.9999 0.001 0.5 2"/></default>'
         f"<worldbody>{bodies}</worldbody><equality>{closed}</equality></mujoco>"
     )
+
+
+def _inertial(body, centre):
+    """Mass and principal moments; of a body in the plane, three that are alike."""
+    moments = np.diag(np.asarray(body.inertia) * np.eye(3))
+    return f'<inertial pos="{_words(centre)}" mass="{float(body.mass)!r}" diaginertia="{_words(moments)}"/>'
 
 
 def _words(numbers):
