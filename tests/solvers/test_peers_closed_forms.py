@@ -8,14 +8,10 @@ import pytest
 from jax.numpy import cos, exp, log, sin, sqrt
 
 import dae_jax
+from tests.peers import BDF, DUMMY, RADAU, solve
 
 
-# A BDF method takes many small steps, whose errors add up.
-METHODS = {
-    "radau": (dae_jax.RadauIIA5(), None),
-    "bdf": (dae_jax.BDF(), None),
-    "dummy": (dae_jax.DOP853(), dae_jax.DummyDerivatives()),
-}
+METHODS = {"radau": RADAU, "bdf": BDF, "dummy": DUMMY}
 OMEGA = 2 * np.pi
 
 
@@ -107,12 +103,10 @@ EXAMPLES = {
 
 def error(residual, exact, t0, t1, method, tolerance):
     """Relative to the largest value of each unknown, or to 1."""
-    solver, formulation = METHODS[method]
     times = jnp.linspace(t0, t1, 11)
-    sol = dae_jax.daesolve(
-        dae_jax.ImplicitDAE(residual), solver, t0, t1, None, exact(t0), yd0=jax.jacfwd(exact)(t0),
-        formulation=formulation, saveat=diffrax.SaveAt(ts=times), max_steps=100_000,
-        stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
+    sol = solve(
+        dae_jax.ImplicitDAE(residual), METHODS[method], t0, t1, exact(t0), rtol=tolerance,
+        yd0=jax.jacfwd(exact)(t0), saveat=diffrax.SaveAt(ts=times),
     )  # fmt: skip
     truth = jax.vmap(exact)(times)
     return jnp.max(jnp.abs(sol.ys - truth) / jnp.maximum(1, jnp.abs(truth).max(0)))
@@ -122,6 +116,7 @@ def error(residual, exact, t0, t1, method, tolerance):
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_examples_of_solve_dae(name, method):
     """solve_dae `examples/daes/` and `examples/ides/`, of the names here; that by Weissinger is also the example of Matlab's ode15i."""
+    # A BDF method takes many small steps, whose errors add up.
     assert error(*EXAMPLES[name], method, 1e-10) < (1e-6 if method == "bdf" else 1e-7)
 
 

@@ -9,20 +9,7 @@ from jax.numpy import cos, exp, sin
 from scipy.integrate import solve_ivp
 
 import dae_jax
-
-
-PROJECTION = (dae_jax.OrthogonalProjection(dae_jax.DOP853()), None)
-TANGENT = (dae_jax.TangentSpace(dae_jax.DOP853()), None)
-RADAU, BDF = (dae_jax.RadauIIA5(), None), (dae_jax.BDF(), None)
-GGL, DUMMY = (dae_jax.RadauIIA5(), dae_jax.GGL()), (dae_jax.DOP853(), dae_jax.DummyDerivatives())
-
-
-def solve(system, method, t0, t1, y0, args=None, tolerance=1e-9, **options):
-    solver, formulation = method
-    options = {"stepsize_controller": diffrax.PIDController(rtol=tolerance, atol=tolerance), **options}
-    return dae_jax.daesolve(
-        system, solver, t0, t1, None, y0, args, formulation=formulation, max_steps=100_000, **options
-    )  # fmt: skip
+from tests.peers import BDF, DUMMY, GGL, PROJECTION, RADAU, TANGENT, solve
 
 
 def by_scipy(field, t1, y0):
@@ -82,9 +69,7 @@ def test_a_closed_pendulum_of_several_links(n, name):
         rates = jnp.linalg.solve(matrix, jnp.concatenate([system.force(0.0, q, v, None), -turned]))[:n]
         return jnp.concatenate([v, rates])
 
-    sol = solve(
-        system, method, 0.0, 30.0, (q, v), tolerance=1e-10, saveat=diffrax.SaveAt(ts=[0.0, 2.0, 10.0, 20.0, 30.0])
-    )
+    sol = solve(system, method, 0.0, 30.0, (q, v), rtol=1e-10, saveat=diffrax.SaveAt(ts=[0.0, 2.0, 10.0, 20.0, 30.0]))
     truth = by_scipy(lambda t, y: np.asarray(field(t, y)), 2.0, np.concatenate([q, v]))
     np.testing.assert_allclose(np.concatenate([x[1] for x in sol.ys]), truth, atol=1e-6)
     # Between steps a method for residuals is as accurate as its steps.
@@ -121,7 +106,7 @@ def test_feketes_points_are_reached(method):
         return jnp.sum(apart / (jnp.sum(apart**2, 2) + jnp.eye(20))[..., None], 1) - v / 2
 
     system = dae_jax.ConstrainedSystem(force, lambda t, p, args: jnp.sum(p**2, 1) - 1)
-    sol = solve(system, method, 0.0, 1000.0, (points, np.zeros((20, 3))), tolerance=1e-10)
+    sol = solve(system, method, 0.0, 1000.0, (points, np.zeros((20, 3))), rtol=1e-10)
     np.testing.assert_allclose(sol.ys[0][0], np.reshape(FEKETE.split(), (20, 3)).astype(float), atol=1e-9)
     np.testing.assert_allclose(sol.ys[1], 0, atol=1e-9)
     np.testing.assert_allclose(dae_jax.multipliers(system, sol), 4.75, atol=1e-9)
@@ -154,7 +139,7 @@ def test_algebraic_variables_have_gradients(method):
 
     def end(g):
         start = np.array([3.0, -1 / 3]), jnp.stack([4.0, 0.25, (4 * g - 25 / 144) / 25])
-        return solve(system, method, 0.0, 0.4, start, g, tolerance=1e-10).ys[1][-1]
+        return solve(system, method, 0.0, 0.4, start, g, rtol=1e-10).ys[1][-1]
 
     def truth(g):
         start = [np.arctan2(3, 4), -1 / 12]
@@ -171,7 +156,7 @@ def test_algebraic_variables_have_gradients(method):
 def test_gradients_do_not_depend_on_how_equations_are_multiplied(method, factor):
     """casadi/casadi#521 and #301: wrong adjoint sensitivities of 0 = a (q t²/p − q̇) by p, q₀, t₀ and t₁."""
     system = dae_jax.ImplicitDAE(lambda t, q, qd, p: factor * (q * t**2 / p - qd))
-    end = lambda q, p, t0, t1: solve(system, method, t0, t1, q[None], p, tolerance=1e-10).ys[-1, 0]
+    end = lambda q, p, t0, t1: solve(system, method, t0, t1, q[None], p, rtol=1e-10).ys[-1, 0]
     exact = lambda q, p, t0, t1: q * exp((t1**3 - t0**3) / (3 * p))
     at = (7.1, 2.0, 0.7, 2.3)
     found, truth = (jax.grad(f, (0, 1, 2, 3))(*map(jnp.asarray, at)) for f in (end, exact))
