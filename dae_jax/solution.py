@@ -296,11 +296,12 @@ def _is_one_each(tolerance: PyTree) -> bool:
 def _last(ts: Float[Array, "*batch times"], ys: State) -> Any:
     if ts.ndim > 1:
         return jax.vmap(_last)(ts, ys)
-    last = _last_saved(ts)
+    last = last_saved(ts)
     return jax.tree.map(lambda y: y[last], ys)
 
 
-def _last_saved(ts: Float[Array, " times"]) -> Any:
+def last_saved(ts: Float[Array, " times"]) -> Any:
+    """The number of the last row that was saved; 0 where none was."""
     return jnp.maximum(jnp.sum(jnp.isfinite(ts)) - 1, 0)
 
 
@@ -308,7 +309,7 @@ def without_padding(ts: Float[Array, "*batch times"], ys: State) -> tuple[Any, A
     """Saved times and states with padding, times that are infinite, overwritten by the last ones that were saved: every
     function of them then has its value there, and its largest and smallest are those over the saved times.
     """
-    at = jnp.minimum(jnp.arange(ts.shape[0]), _last_saved(ts))
+    at = jnp.minimum(jnp.arange(ts.shape[0]), last_saved(ts))
     return ts[at], jax.tree.map(lambda y: y[at], ys)
 
 

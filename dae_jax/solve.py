@@ -109,7 +109,8 @@ def daesolve(
     **Returns** a `DAESolution`.
 
     Errors: `ValueError` or `TypeError` in a sentence for wrong input that is concrete; `RuntimeError` where the solve
-    fails, or a `RESULTS` code with `throw=False`. An `AccuracyWarning` where it does not fail, but the answer is doubtful: it has
+    fails, or a `RESULTS` code with `throw=False`: then what is saved at times that it did not reach is infinite, also that at t1, and its
+    derivatives are NaN; `sol.end` is where it stopped. An `AccuracyWarning` where it does not fail, but the answer is doubtful: it has
     drifted off the constraints by more than a thousand tolerances, fixed steps are too large for the motion, a million steps may
     add up their errors, it has passed a configuration in which the constraints depend on each other (seen with up to 32 of
     them) or a mass is negative, or the equations switch with time more than once in a step, where a pulse may be stepped over; in a

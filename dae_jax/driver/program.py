@@ -35,6 +35,7 @@ from .felt_steps import OneDirection, by_felt_steps
 from .followed_steps import Steps, as_bits, if_reached, of_bits
 from .outcome import judged
 from .problem import Problem, Program, split
+from .reached import with_derivatives, without_stop
 from .resets import Reset, solve_with_resets
 from .start import saved_parts
 from .switches import warn_of_moving_switches
@@ -71,8 +72,12 @@ def _jitted(program: Program, arrays: Arrays, within: bool) -> Any:
     waiting.begin(always=not isinstance(solve.progress_meter, diffrax.NoProgressMeter))
     solve.refuse_wrong_functions(problem)
     with settled(program.leaves):
-        sol, start = solve_with_resets(solve, problem) if isinstance(solve.event, Reset) else solve(problem)
-    return Split.of(sol), start if within else start._replace(off=None)
+        if isinstance(solve.event, Reset):
+            sol, start = solve_with_resets(solve, problem)
+        else:
+            sol, start = solve(problem)
+            sol = without_stop(sol, solve.saveat)
+    return Split.of(with_derivatives(sol, inexact(arrays))), start if within else start._replace(off=None)
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -66,9 +66,9 @@ def identify(
     **Arguments**
 
     - `model`: a JAX function of `params` to what was measured, any pytree of arrays. A `daesolve` in it takes
-      `adjoint=diffrax.ForwardMode()`; with `throw=False` and `SaveAt(ts=...)` parameters on the way at which it fails are turned
-      down (by `SaveAt(t1=True)` it has the last state that it reached, which passes for the end). Its tolerance should be small
-      beside the noise: a derivative is as accurate as the solve. Its `AccuracyWarning`s are those of `model(found.params)`.
+      `adjoint=diffrax.ForwardMode()`; with `throw=False` parameters on the way at which it fails are turned down. Its tolerance
+      should be small beside the noise: a derivative is as accurate as the solve. Its `AccuracyWarning`s are those of
+      `model(found.params)`.
     - `params`: any pytree of numbers: the start. What is found is the minimum that it leads to.
     - `data`: what was measured, in the structure of what `model` returns, with all numbers finite: what is missing is left out of
       both.
