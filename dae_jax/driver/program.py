@@ -274,7 +274,7 @@ class Solve:
             with settled(program.leaves):
                 solve, problem = program.whole(arrays)
                 given, rest = changing(solve, problem)
-                solve = dataclasses.replace(solve, adjoint=OneDirection(), saveat=saveat)
+                solve = dataclasses.replace(solve, adjoint=OneDirection(solve.between()), saveat=saveat)
                 solved = lambda given: steps_of(*with_changes(solve, problem, eqx.combine(given, rest)), failed)
                 return by_felt_steps(solved, given, changes)
 
@@ -336,6 +336,8 @@ class Solve:
         return self.saves_steps() and self.has_derivative_apart()
 
     def between(self) -> bool:
-        """Whether points between steps are asked for."""
+        """Whether points between steps are asked for, or of a derivative's steps will be."""
+        if isinstance(self.adjoint, OneDirection) and self.adjoint.between:
+            return True
         at_times = any(part.ts is not None for part in saved_parts(self.saveat))
         return (self.saveat.dense and not self.recording) or at_times or self.event is not None
