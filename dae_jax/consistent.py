@@ -175,6 +175,27 @@ def consistent_state(
     traced, of a mechanism within `jit` and `vmap` only; `NotImplementedError` for its derivative where it has more than 256
     unknowns and hidden equations.
     """
+    return _consistent(system, t0, y0, args, fixed, rates, yd0)
+
+
+def consistent_after(system: System, t: Time, y: State, args: Args, fixed: State) -> Any:
+    """The nearest consistent state to one that a reset has made. Of a system that is no mechanism, variables whose derivative occurs in
+    the equations are what they were set to, where the others can be such that all is consistent: who lets a ball bounce does not say
+    what becomes of a contact's force, and no part of the way to that is one of its velocity.
+    """
+    return _consistent(system, t, y, args, fixed, keeps=True)
+
+
+def _consistent(
+    system: System,
+    t0: Time,
+    y0: State,
+    args: Args,
+    fixed: State,
+    rates: State = None,
+    yd0: State = None,
+    keeps: bool = False,
+) -> Any:
     refuse_wrong_state(system, y0)
     system, args = opened(current((with_rates(system, yd0, y0), args)))
     y0 = as_floats(y0)
@@ -189,7 +210,7 @@ def consistent_state(
     if is_mechanism(system) and rates is None:
         found, fine, remains = _nearest_of_mechanism(system, t0, y0, args, masks)
     else:
-        found, fine, remains = _nearest_of_any(system, t0, y0, args, masks, rates)
+        found, fine, remains = _nearest_of_any(system, t0, y0, args, masks, rates, keeps)
     if not isinstance(fine, Tracer) and not bool(fine):
         said, instead = "The initial state `y0` violates", "No consistent state was found near `y0`; left over are"
         raise ValueError(
@@ -215,14 +236,25 @@ def _nearest_of_mechanism(system: ConstrainedSystem, t: Time, y0: State, args: A
 
 
 @quickly_compiled
-def _nearest_of_any(system: System, t: Time, y0: State, args: Args, masks: State, rates: State) -> Any:
+def _nearest_of_any(
+    system: System, t: Time, y0: State, args: Args, masks: State, rates: State, keeps: bool = False
+) -> Any:
     form = ResidualForm.of(system, t, y0, args)
     values = form.encode(y0)
     t = jnp.asarray(t, values.dtype)
     ode = StructuralODE.of(form, values.dtype, complete=True)
+    rates = None if rates is None else form.encode(rates)
+
+    def nearest(ode: StructuralODE, values: Flat, freedom: Float[Array, " n"]) -> tuple[Flat, Unsolved]:
+        y = ode.start(t, values, freedom, rates)
+        return y, _left_over(ode, t, y, values, jnp.zeros_like(t))
+
     freedom = jnp.where(form.encode(masks), 0, 1)
-    y = ode.start(t, values, freedom, None if rates is None else form.encode(rates))
-    remains = _left_over(ode, t, y, values, jnp.zeros_like(t))
+    if keeps:
+        of_others = jnp.where(LinearisedResidual.of(form, values).structure.differential, 0, freedom)
+        _, remains = nearest(*constant((ode, values, of_others)))
+        freedom = jnp.where(remains.consistent(), of_others, freedom)
+    y, remains = nearest(ode, values, freedom)
     fine = remains.consistent()
     return jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), ode.decode(t, y)), fine, remains
 

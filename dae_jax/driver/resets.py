@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from .._compat import while_loop
 from ..compiler import one_kernel
 from ..compiler.types import Arrays
-from ..consistent import consistent_state
+from ..consistent import consistent_after
 from ..solution import RESULTS, DAESolution, Split, precision_of
 from ..systems import System
 from ..types import Args, BoolScalar, Scalar, State, Time
@@ -46,7 +46,8 @@ class Reset(eqx.Module):
     - `condition(t, y, args, **kwargs)`: a real number; an event is where it crosses zero, located on the solver's dense
       output.
     - `reset(t, y, args) -> (y, args)`: the state and the `args` that the solve goes on with. The nearest consistent state to
-      it is taken, in the sense of `consistent_state`.
+      it is taken, in the sense of `consistent_state`; of a `SemiExplicitDAE` or an `ImplicitDAE` such that variables whose derivative
+      occurs in the equations keep what they are set to, if the others (multipliers, currents) can be consistent with them.
     - `direction`: `True` for upcrossings only, `False` for downcrossings only, in the direction in which the solve goes.
     - `fixed`: entries of the state that are kept when it is made consistent, as in `consistent_state`.
     - `max_resets`: how many there may be; one more ends the solve with `RESULTS.too_many_jumps`, and so do resets that pile
@@ -257,12 +258,12 @@ def _after(system: System, reset: Reset, t: Time, y: State, args: Args) -> tuple
     the state after it is, the condition may come to move by more: a rod that is longer from here on has left the stop.)
     """
     wanted, new = reset.reset(t, y, args)
-    consistent = consistent_state(system, t, wanted, new, fixed=reset.fixed)
+    consistent = consistent_after(system, t, wanted, new, reset.fixed)
     of = lambda y, args: jnp.asarray(reset.condition(t, y, args), jnp.result_type(t))
     numbers = (eqx.filter(a, _is_number) for a in (new, args))
     after = jax.tree.map(lambda x, like: jnp.asarray(x, jnp.result_type(like)), *numbers)
     before = of(y, args)
-    moved = of(consistent_state(system, t, y, args), args) - before
+    moved = of(consistent_after(system, t, y, args, None), args) - before
     found, moved = lax.stop_gradient((jnp.abs(before), jnp.abs(moved)))
     other = jnp.any(jnp.stack([jnp.any(a != b) for a, b in zip(*map(jax.tree.leaves, (wanted, y)), strict=True)]))
     return consistent, after, other.astype(found.dtype), found, moved
