@@ -14,8 +14,8 @@ from jaxtyping import Array, Bool, Float, Int
 from ..compiler import compiles
 from .definite_factors import definite_pivot
 from .semidefinite import semidefinite_solve
-from .sparse_lu import Factors, eliminated, solved
-from .symbolic_lu import SymbolicLU, symbolic_lu
+from .sparse_ldl import eliminated, solved
+from .symbolic_ldl import SymbolicLDL, symbolic_ldl
 
 
 # What an entry costs in a loop over indices, in parts of one in operations on whole vectors.
@@ -27,7 +27,7 @@ class SparseDefinite:
     """Matrices with couplings at (`rows`, `columns`), rows < columns. Compared by identity: keep one for each pattern.
 
     The order is one of little fill, found once; a definite matrix needs no other pivots. The elimination is loops over indices
-    (`sparse_lu`), which take little to compile; without our compiler it is dense.
+    (`sparse_ldl`), which take little to compile; without our compiler it is dense.
     """
 
     size: int
@@ -45,9 +45,9 @@ class SparseDefinite:
         return np.concatenate([own, self.rows, self.columns]), np.concatenate([own, self.columns, self.rows])
 
     @functools.cached_property
-    def symbolic(self) -> SymbolicLU:
+    def symbolic(self) -> SymbolicLDL:
         """The order, and the fill."""
-        return symbolic_lu(*self._places, np.arange(self.size))
+        return symbolic_ldl(self.size, self.rows, self.columns)
 
     @property
     def cost(self) -> int:
@@ -56,14 +56,12 @@ class SparseDefinite:
 
     def factors(self, diagonal: Float[Array, " n"], couplings: Float[Array, " c"]) -> tuple[Array, ...]:
         """What is found once for several solves with positive definite S, given by its diagonal and its entries at (`rows`, `columns`)."""
-        entries = lax.stop_gradient(jnp.concatenate([diagonal, couplings, couplings]))
-        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (entries, self.symbolic))
-        if not compiles(eliminated, *shapes):
+        entries, order = lax.stop_gradient(jnp.concatenate([diagonal, couplings])), self.symbolic
+        if not compiles(eliminated, *jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (entries, order))):
             return ()
-        order, own = self.symbolic, entries[self.symbolic.rows]
-        found = eliminated(entries, order)
-        pivots = definite_pivot(1 / found.lu[order.diagonal] / found.scale, own, self.size)
-        return *found, jnp.all(pivots > 0)
+        u = eliminated(entries, order)
+        pivots = definite_pivot(1 / u[order.start[:-1]], entries[order.order], self.size)
+        return u, jnp.all(pivots > 0)
 
     def solve(
         self,
@@ -74,14 +72,14 @@ class SparseDefinite:
     ) -> Float[Array, " n"]:
         """x with S x = b, by the `factors` of S if they are at hand. A pivot that is not positive beyond round-off gives NaN."""
         entries = jnp.concatenate([diagonal, couplings, couplings])
-        *found, regular = lax.stop_gradient(self.factors(diagonal, couplings) if factors is None else factors) or (
-            None,
-        )
-        if regular is None:
+        found = lax.stop_gradient(self.factors(diagonal, couplings) if factors is None else factors)
+        if not found:
             return semidefinite_solve(jnp.zeros((self.size, self.size), b.dtype).at[self._places].set(entries), b)
 
+        u, regular = found
+
         def inverse(_: Any, b: Float[Array, " n"]) -> Float[Array, " n"]:
-            return jnp.where(regular, solved(Factors(*found), b, self.symbolic), jnp.nan)
+            return jnp.where(regular, solved(u, b, self.symbolic), jnp.nan)
 
         return lax.custom_linear_solve(functools.partial(self._apply, entries), b, inverse, inverse, symmetric=True)
 

@@ -44,25 +44,25 @@ def eliminated(a: Inexact[Array, " entries"], k: SymbolicLU) -> Factors:
 
     def row(i: IntScalar, carry: tuple[_Partial, Array]) -> Any:
         (lu, work, largest), scales = carry
-        begin, end = _get(k.given_start, i), _get(k.given_start, i + 1)
-        size = lax.fori_loop(begin, end, lambda p, s: jnp.maximum(s, magnitude(_get(a, _get(k.given, p)))), zero)
+        begin, end = at(k.given_start, i), at(k.given_start, i + 1)
+        size = lax.fori_loop(begin, end, lambda p, s: jnp.maximum(s, magnitude(at(a, at(k.given, p)))), zero)
         scale = 1 / jnp.where(size > 0, size, 1)
-        spread = lambda p, work: _set(work, _get(k.given_at, p), scale * _get(a, _get(k.given, p)))
+        spread = lambda p, work: replaced(work, at(k.given_at, p), scale * at(a, at(k.given, p)))
         found = _Partial(lu, lax.fori_loop(begin, end, spread, work), largest)
-        begin, end = _get(k.group_start, i), _get(k.group_start, i + 1)
+        begin, end = at(k.group_start, i), at(k.group_start, i + 1)
         found = lax.fori_loop(begin, end, lambda g, found: _less_group(k, g, found), found)
-        middle = _get(k.diagonal, i)
-        lu, work, largest = lax.fori_loop(middle, _get(k.start, i + 1), lambda q, found: _kept(k, q, found), found)
-        return _Partial(_set(lu, middle, 1 / _get(lu, middle)), work, largest), _set(scales, i, scale)
+        middle = at(k.diagonal, i)
+        lu, work, largest = lax.fori_loop(middle, at(k.start, i + 1), lambda q, found: _kept(k, q, found), found)
+        return _Partial(replaced(lu, middle, 1 / at(lu, middle)), work, largest), replaced(scales, i, scale)
 
     nothing = _Partial(jnp.zeros(k.at.shape, a.dtype), jnp.zeros(n, a.dtype), zero)
-    (lu, _, largest), scale = _for_each_row(n, row, (nothing, jnp.zeros(n, real)))
+    (lu, _, largest), scale = for_each_row(n, row, (nothing, jnp.zeros(n, real)))
     return Factors(lu, scale, largest)
 
 
 def _less_group(k: SymbolicLU, g: IntScalar, found: _Partial) -> Any:
     """What is left of a row less the rows of U of a group of entries of L."""
-    p, together = _get(k.group, g), _get(k.is_many, g)
+    p, together = at(k.group, g), at(k.is_many, g)
     # Loops of one turn or none: what a branch gives would be copied.
     found = lax.fori_loop(jnp.uint32(0), together, lambda _, found: _less_many(k, p, found), found)
     return lax.fori_loop(together, jnp.uint32(1), lambda _, found: _less_one(k, p, found), found)
@@ -70,42 +70,42 @@ def _less_group(k: SymbolicLU, g: IntScalar, found: _Partial) -> Any:
 
 def _less_one(k: SymbolicLU, p: IntScalar, found: _Partial) -> _Partial:
     lu, work, largest = found
-    column = _get(k.at, p)
-    pivot = _get(k.diagonal, column)
-    factor = _get(work, column) * _get(lu, pivot)
-    subtract = lambda q, work: _add(work, _get(k.at, q), -factor * _get(lu, q))
-    work = _set(work, column, jnp.zeros_like(factor))
-    work = lax.fori_loop(pivot + 1, _get(k.start, column + 1), subtract, work)
-    return _Partial(_set(lu, p, factor), work, jnp.maximum(largest, magnitude(factor)))
+    column = at(k.at, p)
+    pivot = at(k.diagonal, column)
+    factor = at(work, column) * at(lu, pivot)
+    subtract = lambda q, work: added(work, at(k.at, q), -factor * at(lu, q))
+    work = replaced(work, column, jnp.zeros_like(factor))
+    work = lax.fori_loop(pivot + 1, at(k.start, column + 1), subtract, work)
+    return _Partial(replaced(lu, p, factor), work, jnp.maximum(largest, magnitude(factor)))
 
 
 def _less_many(k: SymbolicLU, p: IntScalar, found: _Partial) -> _Partial:
     lu, work, largest = found
-    column = _get(k.at, p)
-    pivots = [_get(k.diagonal, column + j) for j in range(TOGETHER)]
+    column = at(k.at, p)
+    pivots = [at(k.diagonal, column + j) for j in range(TOGETHER)]
     factors: list[Any] = []
     for j, pivot in enumerate(pivots):
         # In the row of U of pivot i the column of pivot j is j − i places after it.
-        others: Any = sum(f * _get(lu, pivots[i] + (j - i)) for i, f in enumerate(factors))
-        factors.append((_get(work, column + j) - others) * _get(lu, pivot))
+        others: Any = sum(f * at(lu, pivots[i] + (j - i)) for i, f in enumerate(factors))
+        factors.append((at(work, column + j) - others) * at(lu, pivot))
     # What follows the columns of these pivots, of each row.
     places = [pivot + (TOGETHER - j) for j, pivot in enumerate(pivots)]
 
     def subtract(q: IntScalar, work: Array) -> Array:
-        terms: Any = sum(f * _get(lu, place + (q - places[-1])) for f, place in zip(factors, places, strict=True))
-        return _add(work, _get(k.at, q), -terms)
+        terms: Any = sum(f * at(lu, place + (q - places[-1])) for f, place in zip(factors, places, strict=True))
+        return added(work, at(k.at, q), -terms)
 
     for j, factor in enumerate(factors):
-        work, lu = _set(work, column + j, jnp.zeros_like(factor)), _set(lu, p + j, factor)
+        work, lu = replaced(work, column + j, jnp.zeros_like(factor)), replaced(lu, p + j, factor)
         largest = jnp.maximum(largest, magnitude(factor))
-    return _Partial(lu, lax.fori_loop(places[-1], _get(k.start, column + TOGETHER), subtract, work), largest)
+    return _Partial(lu, lax.fori_loop(places[-1], at(k.start, column + TOGETHER), subtract, work), largest)
 
 
 def _kept(k: SymbolicLU, q: IntScalar, found: _Partial) -> _Partial:
     """What is left of a row at an entry of U goes there."""
     lu, work, largest = found
-    value = _get(work, _get(k.at, q))
-    lu, work = _set(lu, q, value), _set(work, _get(k.at, q), jnp.zeros_like(value))
+    value = at(work, at(k.at, q))
+    lu, work = replaced(lu, q, value), replaced(work, at(k.at, q), jnp.zeros_like(value))
     return _Partial(lu, work, jnp.maximum(largest, magnitude(value)))
 
 
@@ -113,23 +113,23 @@ def _kept(k: SymbolicLU, q: IntScalar, found: _Partial) -> _Partial:
 def solved(factors: Factors, b: Inexact[Array, " n"], k: SymbolicLU) -> Inexact[Array, " n"]:
     """x with A x = b."""
     lu, n = factors.lu, k.rows.shape[0]
-    less = lambda p, carry: (carry[0] - _get(lu, p) * _get(carry[1], _get(k.at, p)), carry[1])
+    less = lambda p, carry: (carry[0] - at(lu, p) * at(carry[1], at(k.at, p)), carry[1])
 
     def forward(i: IntScalar, x: Array) -> Array:
-        right = _get(factors.scale, i) * _get(b, _get(k.rows, i))
-        return _set(x, i, lax.fori_loop(_get(k.start, i), _get(k.diagonal, i), less, (right, x))[0])
+        right = at(factors.scale, i) * at(b, at(k.rows, i))
+        return replaced(x, i, lax.fori_loop(at(k.start, i), at(k.diagonal, i), less, (right, x))[0])
 
     def backward(i: IntScalar, carry: Any) -> Any:
         x, out = carry
         i = n - 1 - i
-        middle = _get(k.diagonal, i)
-        rest, _ = lax.fori_loop(middle + 1, _get(k.start, i + 1), less, (_get(x, i), x))
-        value = rest * _get(lu, middle)
-        return _set(x, i, value), _set(out, _get(k.columns, i), value)
+        middle = at(k.diagonal, i)
+        rest, _ = lax.fori_loop(middle + 1, at(k.start, i + 1), less, (at(x, i), x))
+        value = rest * at(lu, middle)
+        return replaced(x, i, value), replaced(out, at(k.columns, i), value)
 
     nothing = jnp.zeros(n, jnp.result_type(lu, b))
-    x = _for_each_row(n, forward, nothing)
-    return _for_each_row(n, backward, (x, nothing))[1]
+    x = for_each_row(n, forward, nothing)
+    return for_each_row(n, backward, (x, nothing))[1]
 
 
 @jit
@@ -138,41 +138,41 @@ def solved_transposed(factors: Factors, b: Inexact[Array, " n"], k: SymbolicLU) 
     lu, n = factors.lu, k.rows.shape[0]
 
     def spread(x: Array, value: Array, begin: IntScalar, end: IntScalar) -> Array:
-        return lax.fori_loop(begin, end, lambda p, x: _add(x, _get(k.at, p), -value * _get(lu, p)), x)
+        return lax.fori_loop(begin, end, lambda p, x: added(x, at(k.at, p), -value * at(lu, p)), x)
 
     def forward(i: IntScalar, x: Array) -> Array:
-        middle = _get(k.diagonal, i)
-        value = _get(x, i) * _get(lu, middle)
-        return spread(_set(x, i, value), value, middle + 1, _get(k.start, i + 1))
+        middle = at(k.diagonal, i)
+        value = at(x, i) * at(lu, middle)
+        return spread(replaced(x, i, value), value, middle + 1, at(k.start, i + 1))
 
     def backward(i: IntScalar, carry: Any) -> Any:
         x, out = carry
         i = n - 1 - i
-        value = _get(x, i)
-        return spread(x, value, _get(k.start, i), _get(k.diagonal, i)), _set(
-            out, _get(k.rows, i), value * _get(factors.scale, i)
+        value = at(x, i)
+        return spread(x, value, at(k.start, i), at(k.diagonal, i)), replaced(
+            out, at(k.rows, i), value * at(factors.scale, i)
         )
 
     nothing = jnp.zeros(n, jnp.result_type(lu, b))
-    x = _for_each_row(n, lambda i, x: _set(x, i, _get(b, _get(k.columns, i)).astype(x.dtype)), nothing)
-    x = _for_each_row(n, forward, x)
-    return _for_each_row(n, backward, (x, nothing))[1]
+    x = for_each_row(n, lambda i, x: replaced(x, i, at(b, at(k.columns, i)).astype(x.dtype)), nothing)
+    x = for_each_row(n, forward, x)
+    return for_each_row(n, backward, (x, nothing))[1]
 
 
-def _for_each_row(n: int, step: Callable[[IntScalar, PyTree], PyTree], begin: PyTree) -> PyTree:
+def for_each_row(n: int, step: Callable[[IntScalar, PyTree], PyTree], begin: PyTree) -> PyTree:
     return lax.fori_loop(jnp.uint32(0), jnp.uint32(n), step, begin)
 
 
 # Every index is in bounds, and none is negative, so that there is nothing to count from the end: checks would take half of the time.
 
 
-def _get(x: PyTree, i: IntScalar) -> Any:
+def at(x: PyTree, i: IntScalar) -> Any:
     return x.at[i].get(mode="promise_in_bounds")
 
 
-def _set(x: Array, i: Any, value: Array) -> Array:
+def replaced(x: Array, i: Any, value: Array) -> Array:
     return x.at[i].set(value, mode="promise_in_bounds")
 
 
-def _add(x: Array, i: Any, value: Array) -> Array:
+def added(x: Array, i: Any, value: Array) -> Array:
     return x.at[i].add(value, mode="promise_in_bounds")

@@ -55,10 +55,36 @@ class SymbolicLU(NamedTuple):
 def symbolic_lu(
     rows: Int[np.ndarray, " entries"], columns: Int[np.ndarray, " entries"], pairing: Int[np.ndarray, " n"]
 ) -> SymbolicLU:
-    """The order and the fill of the matrix with entries at (`rows`, `columns`), with pivots at (i, `pairing`[i]).
+    """The order and the fill of the matrix with entries at (`rows`, `columns`), with pivots at (i, `pairing`[i])."""
+    n = len(pairing)
+    paired = pairing[rows]
+    position, start, at = filled(paired, columns, n)
+    variables = np.argsort(position)
+    at_row, at_column = position[paired], position[columns]
+    given = np.lexsort((at_column, at_row))
+    diagonal = np.flatnonzero(np.repeat(np.arange(n), np.diff(start)) == at)
+    indices = (
+        np.argsort(pairing)[variables],
+        variables,
+        start,
+        diagonal,
+        at,
+        np.searchsorted(at_row[given], np.arange(n + 1)),
+        given,
+        at_column[given],
+        *_groups(start, diagonal, at),
+    )
+    return SymbolicLU(*(x.astype(np.uint32) for x in indices))
 
-    By minimum degree on the pattern of A + Aᵀ, of the paired matrix. SuperLU orders, and eliminates, an M-matrix of this pattern:
-    fill only adds negative numbers there, so that what is not 0 in its factors is the fill.
+
+def filled(
+    rows: Int[np.ndarray, " entries"], columns: Int[np.ndarray, " entries"], n: int
+) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n+1"], Int[np.ndarray, " filled"]]:
+    """Of n pivots on the diagonal: which position each takes, and the pattern of L + U in that order, where rows start and the
+    columns of their entries.
+
+    By minimum degree on the pattern of A + Aᵀ. SuperLU orders, and eliminates, an M-matrix of this pattern: fill only adds negative
+    numbers there, so that what is not 0 in its factors is the fill.
 
     Source: J. W. H. Liu, Modification of the minimum-degree algorithm by multiple elimination, ACM Trans. Math. Softw. 11
     (1985); X. S. Li, An overview of SuperLU, ACM Trans. Math. Softw. 31 (2005).
@@ -66,37 +92,18 @@ def symbolic_lu(
     from scipy.sparse import csc_array, csr_array, diags_array
     from scipy.sparse.linalg import splu
 
-    n = len(pairing)
-    paired = pairing[rows]
-    pattern = csr_array((np.ones(len(rows)), (paired, columns)), shape=(n, n))
+    pattern = csr_array((np.ones(len(rows)), (rows, columns)), shape=(n, n))
     both = csr_array(pattern + pattern.T)
     both.setdiag(0)
     both.eliminate_zeros()
     both.data[:] = 1
     m_matrix = csc_array(diags_array((1 + DOMINANCE) * np.maximum(both.sum(1), 1)) - both)
     factors = splu(m_matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    filled = csr_array(csr_array(factors.L != 0) + csr_array(factors.U != 0))
-    filled.sort_indices()
-    position = factors.perm_c
-    if not np.array_equal(position, factors.perm_r):
+    found = csr_array(csr_array(factors.L != 0) + csr_array(factors.U != 0))
+    found.sort_indices()
+    if not np.array_equal(factors.perm_c, factors.perm_r):
         raise AssertionError("An elimination along the diagonal left it.")
-    variables = np.argsort(position)
-    at_row, at_column = position[paired], position[columns]
-    given = np.lexsort((at_column, at_row))
-    row_of_entry = np.repeat(np.arange(n), np.diff(filled.indptr))
-    diagonal = np.flatnonzero(row_of_entry == filled.indices)
-    indices = (
-        np.argsort(pairing)[variables],
-        variables,
-        filled.indptr,
-        diagonal,
-        filled.indices,
-        np.searchsorted(at_row[given], np.arange(n + 1)),
-        given,
-        at_column[given],
-        *_groups(filled.indptr, diagonal, filled.indices),
-    )
-    return SymbolicLU(*(x.astype(np.uint32) for x in indices))
+    return factors.perm_c, found.indptr, found.indices
 
 
 def _groups(
