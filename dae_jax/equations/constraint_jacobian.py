@@ -18,6 +18,7 @@ from ..linalg import Elimination, Factors, SparseDefinite, elimination, factoris
 from ..linalg.semidefinite import LOOPED, UNROLLED, by_lapack
 from ..structure import column_colouring, dependence, seed_matrix
 from ..types import Flat, Time
+from .directions import along_each
 from .manifold_ode import Normals, traced_once
 
 
@@ -118,13 +119,13 @@ class SparseNormals:
     """A by its nonzeros, for holonomic constraints and unit, diagonal or block-diagonal masses.
 
     A is compressed to C = A S, one directional derivative of the constraints a colour, in which row i has at most one
-    column `columns[c, i]` of colour c. The entries of A M⁻¹Aᵀ are then sums over the colours. Products with A and Aᵀ
+    column `columns[c, i]` of colour c; C has its colours as the last axis, along which it is computed. The entries of A M⁻¹Aᵀ are then sums over the colours. Products with A and Aᵀ
     are derivatives of the constraints themselves. Where masses are blocks, M = L Lᵀ, C is that of A L⁻ᵀ, whose masses are 1; a row
     of it has all columns of a block of which A has one. Compared by identity: keep one for each pattern.
     """
 
     columns: Int[np.ndarray, "colours c"]
-    seeds: Float[np.ndarray, "colours n"]
+    seeds: Float[np.ndarray, "n colours"]
     gram: Elimination | SparseDefinite
 
     @traced_once
@@ -141,9 +142,9 @@ class SparseNormals:
         return *point, *self.gram.factors(*self._products(mass, compressed))
 
     def _compressed(
-        self, ode: Mechanism, t: Time, q: Flat, seeds: Float[Array, "colours n"]
-    ) -> Float[Array, "colours c"]:
-        return jax.vmap(lambda seed: jax.jvp(functools.partial(ode.constraint, t), (q,), (seed,))[1])(seeds)
+        self, ode: Mechanism, t: Time, q: Flat, seeds: Float[Array, "n colours"]
+    ) -> Float[Array, "c colours"]:
+        return along_each(functools.partial(ode.constraint, t), q, seeds)
 
     @traced_once
     def along(self, ode: Mechanism, normals: Normals, x: Float[Array, " n"]) -> Float[Array, " c"]:
@@ -176,9 +177,10 @@ class SparseNormals:
         return self.gram.solve(*found, b)
 
     def _products(
-        self, mass: Float[Array, "..."] | None, compressed: Float[Array, "colours c"]
+        self, mass: Float[Array, "..."] | None, compressed: Float[Array, "c colours"]
     ) -> tuple[Float[Array, " c"], Float[Array, " couplings"]]:
         """The diagonal of A M⁻¹Aᵀ, and its couplings."""
+        compressed = compressed.T
         weighted = compressed if mass is None or mass.ndim == 3 else compressed * self._inverse_masses(mass)
         rows, columns = self.gram.rows, self.gram.columns
         shared = (self.columns[:, rows] == self.columns[:, columns]) & (self.columns[:, rows] >= 0)
@@ -193,14 +195,14 @@ class SparseNormals:
     @traced_once
     def lengths(self, ode: Mechanism, normals: Normals) -> Float[Array, " c"]:
         """The length of each row of A."""
-        return jnp.sqrt(jnp.sum(self._entries(ode, normals) ** 2, 0))
+        return jnp.sqrt(jnp.sum(self._entries(ode, normals) ** 2, 1))
 
     @traced_once
     def reach(self, ode: Mechanism, normals: Normals, sizes: Float[Array, " n"]) -> Float[Array, " c"]:
         """|A| s: what changes of that size may move each constraint by."""
-        return jnp.sum(jnp.abs(self._entries(ode, normals)) * sizes[np.maximum(self.columns, 0)], 0)
+        return jnp.sum(jnp.abs(self._entries(ode, normals)) * sizes[np.maximum(self.columns.T, 0)], 1)
 
-    def _entries(self, ode: Mechanism, normals: Normals) -> Float[Array, "colours c"]:
+    def _entries(self, ode: Mechanism, normals: Normals) -> Float[Array, "c colours"]:
         """C of A itself, whatever the masses."""
         t, q, mass, compressed, *_ = normals
         if mass is not None and mass.ndim == 3:
@@ -208,7 +210,7 @@ class SparseNormals:
         return compressed
 
     def _inverse_masses(self, mass: Float[Array, "..."]) -> Float[Array, "colours c"]:
-        return 1 / (jnp.broadcast_to(mass, (self.seeds.shape[1],))[np.maximum(self.columns, 0)])
+        return 1 / (jnp.broadcast_to(mass, (len(self.seeds),))[np.maximum(self.columns, 0)])
 
 
 def sparse_normals(pattern: Bool[np.ndarray, "c n"], block: int = 1) -> SparseNormals | None:
@@ -233,7 +235,7 @@ def _sparse_normals(pattern: bytes, shape: tuple[int, int]) -> SparseNormals:
     # What would be left to LAPACK.
     if order.rest_size > LOOPED and SparseDefinite.of(gram).cost < order.cost:
         order = SparseDefinite.of(gram)
-    return SparseNormals(columns, seed_matrix(colours).T, order)
+    return SparseNormals(columns, seed_matrix(colours), order)
 
 
 def constraint_pattern(constraint: Callable[[Time, Flat], Array], t: Time, q: Flat) -> Bool[np.ndarray, "c n"] | None:
@@ -244,11 +246,10 @@ def constraint_pattern(constraint: Callable[[Time, Flat], Array], t: Time, q: Fl
         return None
 
 
-def _unweighted(factor: Float[Array, "b k k"], seeds: Float[Array, "colours n"]) -> Float[Array, "colours n"]:
+def _unweighted(factor: Float[Array, "b k k"], seeds: Float[Array, "n colours"]) -> Float[Array, "n colours"]:
     """L⁻ᵀ of the blocks times each seed."""
-    by_block = jnp.moveaxis(seeds.reshape(len(seeds), *factor.shape[:2]), 0, -1)
-    solved = jax.scipy.linalg.solve_triangular(factor, by_block, trans=1, lower=True)
-    return jnp.moveaxis(solved, -1, 0).reshape(seeds.shape)
+    by_block = seeds.reshape(*factor.shape[:2], -1)
+    return jax.scipy.linalg.solve_triangular(factor, by_block, trans=1, lower=True).reshape(seeds.shape)
 
 
 def mass_solve(

@@ -160,6 +160,7 @@ def solved_transposed(factors: Factors, b: Inexact[Array, " n"], k: SymbolicLU) 
 
 
 def for_each_row(n: int, step: Callable[[IntScalar, PyTree], PyTree], begin: PyTree) -> PyTree:
+    """Steps for n rows, one after the other."""
     return lax.fori_loop(jnp.uint32(0), jnp.uint32(n), step, begin)
 
 
@@ -167,12 +168,15 @@ def for_each_row(n: int, step: Callable[[IntScalar, PyTree], PyTree], begin: PyT
 
 
 def at(x: PyTree, i: IntScalar) -> Any:
+    """x[i]."""
     return x.at[i].get(mode="promise_in_bounds")
 
 
 def replaced(x: Array, i: Any, value: Array) -> Array:
+    """x with another entry i."""
     return x.at[i].set(value, mode="promise_in_bounds")
 
 
 def added(x: Array, i: Any, value: Array) -> Array:
+    """x with more at entry i."""
     return x.at[i].add(value, mode="promise_in_bounds")

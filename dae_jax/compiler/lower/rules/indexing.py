@@ -138,19 +138,33 @@ def _at_known_places(context: Context, x: View, indices: np.ndarray, p: Params, 
     strides = _even(places)
     if inside and strides is not None:
         return View(x.dtype, shape, x.buffer, strides, code.plus(x.offset, int(places[(0,) * places.ndim])))
-    table = context.memory.constant_view(np.where(order >= 0, places, -1))
+    # Along axes of even steps places are worked out: the last may be in vectors that lie together.
+    steps = [_step(places, axis) if inside else None for axis in range(places.ndim)]
+    origin = places[tuple(slice(None) if step is None else slice(1) for step in steps)]
+    table = context.memory.constant_view(np.where(order >= 0, places, -1) if not inside else origin)
 
     def read(index: Sequence[Index]) -> Any:
         if not any(isinstance(i, Value) for i in index):
             k: Any = tuple(index)
             return load(code, x.buffer, code.plus(x.offset, int(places[k]))) if order[k] >= 0 else fill
-        place = context.memory.entry(table, index)
+        place = context.memory.entry(table, [i if step is None else 0 for i, step in zip(index, steps, strict=True)])
         if inside:
+            for i, step in zip(index, steps, strict=True):
+                place = place if step is None else code.plus(place, code.times(i, step))
             return load(code, x.buffer, code.plus(x.offset, place))
         number = load(code, x.buffer, code.plus(x.offset, code.intrinsic("smax", "i64", place, 0)))
         return code.select(code.op("icmp sge", "i64", place, 0, result="i1"), number, fill, x.buffer.kind)
 
     return Fused(x.dtype, shape, read, x.buffers)
+
+
+def _step(places: np.ndarray, axis: int) -> int | None:
+    """From each place to the next along an axis, where that is the same everywhere."""
+    steps = np.diff(places, axis=axis)
+    if not steps.size:
+        return 0
+    first = int(steps[(0,) * steps.ndim])
+    return first if (steps == first).all() else None
 
 
 def _even(places: np.ndarray) -> tuple[int, ...] | None:
