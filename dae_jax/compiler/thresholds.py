@@ -38,6 +38,8 @@ class Thresholds:
     Factorisations and sorting, which stand for LAPACK's and for XLA's:
     - `matrix_written_out`: rows up to which a factorisation has every entry in a register. Systems of 4 and of 8 unknowns take 0.09
       and 0.27 µs so, 0.18 and 0.72 in loops, 1.1 and 1.5 by LAPACK; of 8 twice the time to compile.
+    - `triangle_written_out`: the same of Cholesky's, and of triangular systems. A body in space has blocks of 7: the six loops of a
+      Stewart platform, with 13 of them, by DOP853 take 730 µs a step so and 880 in loops, and as long to compile.
     - `largest_matrix`: rows above which it is LAPACK's, which is called: with 32 it takes 21 µs and LAPACK 9, with 64 it is 310 and 33.
     - `longest_sort`: entries above which sorting, by comparing all pairs, is left to XLA: 64 take 5 µs and XLA's 3, 256 66 and 15.
 
@@ -73,6 +75,7 @@ class Thresholds:
     turns_written_out: int = 8000
     compaction: int = 2
     matrix_written_out: int = 6
+    triangle_written_out: int = 7
     largest_matrix: int = 32
     longest_sort: int = 256
     instructions: int = 200_000

@@ -119,9 +119,10 @@ class SparseNormals:
     """A by its nonzeros, for holonomic constraints and unit, diagonal or block-diagonal masses.
 
     A is compressed to C = A S, one directional derivative of the constraints a colour, in which row i has at most one
-    column `columns[c, i]` of colour c; C has its colours as the last axis, along which it is computed. The entries of A M⁻¹Aᵀ are then sums over the colours. Products with A and Aᵀ
-    are derivatives of the constraints themselves. Where masses are blocks, M = L Lᵀ, C is that of A L⁻ᵀ, whose masses are 1; a row
-    of it has all columns of a block of which A has one. Compared by identity: keep one for each pattern.
+    column `columns[c, i]` of colour c; C has its colours as the last axis, along which it is computed. The entries of A M⁻¹Aᵀ
+    are then sums over the colours. Products with A and Aᵀ are derivatives of the constraints themselves. Where masses are
+    blocks, M = L Lᵀ, C is that of A L⁻ᵀ, whose masses are 1; a row of it has all columns of a block of which A has one.
+    Compared by identity: keep one for each pattern.
     """
 
     columns: Int[np.ndarray, "colours c"]
@@ -180,13 +181,26 @@ class SparseNormals:
         self, mass: Float[Array, "..."] | None, compressed: Float[Array, "c colours"]
     ) -> tuple[Float[Array, " c"], Float[Array, " couplings"]]:
         """The diagonal of A M⁻¹Aᵀ, and its couplings."""
-        compressed = compressed.T
         weighted = compressed if mass is None or mass.ndim == 3 else compressed * self._inverse_masses(mass)
-        rows, columns = self.gram.rows, self.gram.columns
+        at = lambda x, places: jnp.ravel(x).at[places].get(mode="promise_in_bounds")
+        diagonal = jnp.sum(weighted * compressed, 1)
+        found = [jnp.sum(at(weighted, i) * at(compressed, j), 0) for _, i, j in self._shared]
+        if not found:
+            return diagonal, diagonal[:0]
+        order = np.argsort(np.concatenate([couplings for couplings, *_ in self._shared]))
+        return diagonal, take(jnp.concatenate(found), order)
+
+    @functools.cached_property
+    def _shared(self) -> list[tuple[Int[np.ndarray, " k"], Int[np.ndarray, "s k"], Int[np.ndarray, "s k"]]]:
+        """The couplings of rows that share s columns, and where in C each of both rows has them: for each s that there is."""
+        rows, columns, colours = self.gram.rows, self.gram.columns, len(self.columns)
         shared = (self.columns[:, rows] == self.columns[:, columns]) & (self.columns[:, rows] >= 0)
-        at = lambda x, entries: jax.vmap(lambda row: take(row, entries))(x)
-        couplings = jnp.sum(jnp.asarray(shared, weighted.dtype) * at(weighted, rows) * at(compressed, columns), 0)
-        return jnp.sum(weighted * compressed, 0), couplings
+        counts, found = shared.sum(0), []
+        for count in np.unique(counts):
+            of = np.flatnonzero(counts == count)
+            colour = np.argsort(~shared[:, of], 0, kind="stable")[:count]
+            found.append((of, colours * rows[of] + colour, colours * columns[of] + colour))
+        return found
 
     def least_norm(self, ode: Mechanism, normals: Normals, b: Float[Array, " c"]) -> Float[Array, " c"]:
         """The only such x: no constraint depends on others."""
@@ -209,8 +223,8 @@ class SparseNormals:
             return self._compressed(ode, t, q, jnp.asarray(self.seeds, q.dtype))
         return compressed
 
-    def _inverse_masses(self, mass: Float[Array, "..."]) -> Float[Array, "colours c"]:
-        return 1 / (jnp.broadcast_to(mass, (len(self.seeds),))[np.maximum(self.columns, 0)])
+    def _inverse_masses(self, mass: Float[Array, "..."]) -> Float[Array, "c colours"]:
+        return 1 / (jnp.broadcast_to(mass, (len(self.seeds),))[np.maximum(self.columns.T, 0)])
 
 
 def sparse_normals(pattern: Bool[np.ndarray, "c n"], block: int = 1) -> SparseNormals | None:

@@ -14,8 +14,8 @@ from jax.extend.core import Jaxpr, Literal
 from jaxtyping import Array, Float
 
 from ..compiler.jaxprs.walk import CALLS, called
-from ..structure.incidence_entries import ELEMENTWISE
 from ..compiler.types import Equation, Params
+from ..structure.incidence_entries import ELEMENTWISE
 from ..types import Flat
 
 
@@ -49,7 +49,8 @@ def _step(eqn: Equation, args: list[_Marked]) -> list[_Marked]:
     elif inner is not None:
         return _run(inner.jaxpr, inner.consts, args)
     elif eqn.primitive.name in ELEMENTWISE and eqn.primitive.name not in _ALIKE:
-        found = _bound(eqn, eqn.params, *(x if mark or not jnp.ndim(x) else x[..., None] for x, mark in args))
+        rank = eqn.outvars[0].aval.ndim
+        found = _bound(eqn, eqn.params, *(_beside(x, mark, rank) for x, mark in args))
     elif eqn.primitive.name in _ALIKE:
         count = next(x.shape[-1] for x, mark in args if mark)
         found = _bound(eqn, eqn.params, *(x if mark else _repeated(x, count) for x, mark in args))
@@ -63,6 +64,13 @@ def _step(eqn: Equation, args: list[_Marked]) -> list[_Marked]:
 
 def _bound(eqn: Equation, params: Params, *xs: Any) -> Any:
     return eqn.primitive.bind(*xs, **eqn.primitive.get_bind_params(params))
+
+
+def _beside(x: Any, marked: bool, rank: int) -> Any:
+    """An operand of an entrywise operation whose result has so many other axes; a number goes with all entries."""
+    if not marked:
+        return x[..., None] if jnp.ndim(x) else x
+    return x if x.ndim > rank else x.reshape((1,) * rank + x.shape)
 
 
 def _repeated(x: Any, count: int) -> Any:

@@ -84,3 +84,54 @@ def test_no_dense_factorisation_and_little_work():
     names = {e.primitive.name for e in equations(jax.make_jaxpr(lambda a, b: DEFINITE.solve(*entries(a), b))(a, a[0]))}
     assert not names & {"cholesky", "lu"}
     assert DEFINITE.symbolic.cost < len(a) ** 3 / 10
+
+
+def sparse_example(seed, n=40):
+    """A random sparse definite matrix."""
+    rng = np.random.default_rng(seed)
+    half = np.where(rng.random((n, n)) < 2.5 / n, rng.normal(size=(n, n)), 0)
+    return SparseDefinite.of(half @ half.T != 0), half @ half.T + np.diag(rng.uniform(0.5, 2, n)), rng
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_random_patterns_equal_numpy_with_derivatives(seed):
+    definite, a, rng = sparse_example(seed)
+    b = rng.normal(size=len(a))
+    solve = lambda a, b: definite.solve(jnp.diagonal(a), a[definite.rows, definite.columns], b)
+    x = np.linalg.solve(a, b)
+    np.testing.assert_allclose(jax.jit(solve)(a, b), x, rtol=1e-10, atol=1e-12)
+    # dx = S⁻¹ (db − dS x), and the transpose of that.
+    weights, db = rng.normal(size=(2, len(a)))
+    y = np.linalg.solve(a, weights)
+    d_couplings, d_b = jax.grad(lambda c, b: weights @ definite.solve(jnp.diagonal(a), c, b), (0, 1))(
+        a[definite.rows, definite.columns], b
+    )
+    np.testing.assert_allclose(d_b, y, rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(
+        d_couplings, -(np.outer(y, x) + np.outer(x, y))[definite.rows, definite.columns], rtol=1e-8, atol=1e-10
+    )
+    np.testing.assert_allclose(
+        jax.jvp(lambda b: solve(a, b), (b,), (db,))[1], np.linalg.solve(a, db), rtol=1e-10, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_factor_is_that_of_the_permuted_matrix(seed):
+    definite, a, _ = sparse_example(seed)
+    k, n = definite.symbolic, len(a)
+    u, regular = definite.factors(jnp.diagonal(a), a[definite.rows, definite.columns])
+    assert regular
+    dense = np.zeros((n, n))
+    dense[np.repeat(np.arange(n), np.diff(k.start)), k.at] = u
+    pivots = 1 / np.diagonal(dense)
+    upper = np.triu(dense, 1) + np.diag(pivots)
+    np.testing.assert_allclose(upper.T / pivots @ upper, a[np.ix_(k.order, k.order)], rtol=1e-12, atol=1e-12)
+    after = np.diff(k.start.astype(int)) - 1
+    assert k.cost == sum(after * (after + 1) // 2)
+
+
+def test_rows_of_one_pattern_are_subtracted_together():
+    k = DEFINITE.symbolic
+    together, alone = k.many_start[-1], k.alone_start[-1]
+    assert together > 0
+    assert 4 * together + alone == len(k.at) - len(k.order)

@@ -124,7 +124,7 @@ def cholesky(a: Array, **_: object) -> Any:
     """L with L Lᴴ = a, of its lower half; not a number where a is not positive definite."""
     refuse_large("cholesky", a.shape[-1])
     n = a.shape[-1]
-    return of_batch(_cholesky_written_out if n <= THRESHOLDS.matrix_written_out else _cholesky_in_loop, a.ndim - 2)(a)
+    return of_batch(_cholesky_written_out if n <= THRESHOLDS.triangle_written_out else _cholesky_in_loop, a.ndim - 2)(a)
 
 
 def _cholesky_written_out(a: Array) -> Any:

@@ -32,7 +32,7 @@ def triangular_solve(
         forwards = lower != transposed
         if not forwards:
             a, b = a[::-1, ::-1], b[::-1]
-        x = (_written_out if len(a) <= THRESHOLDS.matrix_written_out else _in_loop)(a, b, unit_diagonal)
+        x = (_written_out if len(a) <= THRESHOLDS.triangle_written_out else _in_loop)(a, b, unit_diagonal)
         x = x if forwards else x[::-1]
         return x if left_side else x.T
 
