@@ -16,9 +16,9 @@ from jaxtyping import Array, Float, PyTree
 from .compiler import Decision, at_ease, decision, equations, one_kernel_enabled, without_checks
 from .driver.program import Solve
 from .driver.resets import Reset
-from .equations.constraint_jacobian import SparseNormals
 from .equations.linearised import LinearisedResidual
 from .equations.mechanical import MechanicalODE
+from .equations.sparse_normals import SparseNormals
 from .formulations import AbstractFormulation
 from .linalg import SparseDefinite
 from .linalg.semidefinite import LOOPED, UNROLLED

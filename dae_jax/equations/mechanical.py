@@ -16,16 +16,9 @@ from ..linalg import fixed_point, implicit_root, relative_change, solve
 from ..structure.layout import Layout
 from ..systems import ConstrainedSystem
 from ..types import Args, DType, Flat, Phase, State, Time
-from .constraint_jacobian import (
-    SPARSE_FROM,
-    DenseNormals,
-    Rank,
-    SparseNormals,
-    constraint_pattern,
-    of_rows,
-    sparse_normals,
-)
+from .constraint_jacobian import DenseNormals, Rank, constraint_pattern, of_rows
 from .manifold_ode import Feedback, ManifoldODE, Normals, at_one_instant
+from .sparse_normals import SPARSE_FROM, SparseNormals, sparse_normals
 
 
 # From so many constraints on the forces of multipliers are found by reverse derivatives, at the price of the constraints. Of fewer by

@@ -10,8 +10,9 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
 from ..linalg import factorised, minor_sign, row_products, semidefinite_solve, smallest_pivot, solve_with
 from ..types import IntScalar, Phase, Time
-from .constraint_jacobian import Rank, SparseNormals, mass_solve, matvec, unit_diagonal
+from .constraint_jacobian import Rank, mass_solve, matvec, unit_diagonal
 from .mechanical import MechanicalODE, allowed_contradiction
+from .sparse_normals import SparseNormals
 
 
 # A drift that counts as large as the solution itself, as a part of this: the distance to |q| = 1 is nowhere more than |q|/2.

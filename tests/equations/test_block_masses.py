@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import dae_jax
-from dae_jax.equations.constraint_jacobian import DenseNormals, SparseNormals, dense_mass
+from dae_jax.equations.constraint_jacobian import DenseNormals, dense_mass
 from dae_jax.equations.mechanical import MechanicalODE
+from dae_jax.equations.sparse_normals import SparseNormals
 
 
 BODIES = 8

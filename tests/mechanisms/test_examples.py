@@ -10,8 +10,8 @@ from scipy.integrate import simpson
 import dae_jax
 from dae_jax import mechanisms as m
 from dae_jax.compiler import kernel_call
-from dae_jax.equations.constraint_jacobian import SparseNormals
 from dae_jax.equations.mechanical import MechanicalODE
+from dae_jax.equations.sparse_normals import SparseNormals
 from dae_jax.linalg import SparseDefinite
 
 
