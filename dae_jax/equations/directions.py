@@ -42,20 +42,24 @@ def _run(jaxpr: Jaxpr, consts: Sequence[Any], args: Sequence[_Marked]) -> list[_
 
 
 def _step(eqn: Equation, args: list[_Marked]) -> list[_Marked]:
-    xs, marks = [x for x, _ in args], [mark for _, mark in args]
+    xs, marks, name = [x for x, _ in args], [mark for _, mark in args], eqn.primitive.name
     inner = called(eqn, CALLS)
     if not any(marks):
         found = _bound(eqn, eqn.params, *xs)
     elif inner is not None:
         return _run(inner.jaxpr, inner.consts, args)
-    elif eqn.primitive.name in ELEMENTWISE and eqn.primitive.name not in _ALIKE:
+    elif name in ELEMENTWISE and name not in _ALIKE:
         rank = eqn.outvars[0].aval.ndim
         found = _bound(eqn, eqn.params, *(_beside(x, mark, rank) for x, mark in args))
-    elif eqn.primitive.name in _ALIKE:
+    elif name in _ALIKE:
         count = next(x.shape[-1] for x, mark in args if mark)
-        found = _bound(eqn, eqn.params, *(x if mark else _repeated(x, count) for x, mark in args))
-    elif eqn.primitive.name in _EXTENDED and marks == [True, *[False] * (len(marks) - 1)]:
-        found = _bound(eqn, _EXTENDED[eqn.primitive.name](eqn.params, *xs), *xs)
+        # One truth chooses between whole arrays.
+        stays = [mark or (name == "select_n" and k == 0 and jnp.ndim(x) == 0) for k, (x, mark) in enumerate(args)]
+        found = _bound(
+            eqn, eqn.params, *(x if same else _repeated(x, count) for x, same in zip(xs, stays, strict=True))
+        )
+    elif name in _EXTENDED and marks == [True, *[False] * (len(marks) - 1)]:
+        found = _bound(eqn, _EXTENDED[name](eqn.params, *xs), *xs)
     else:
         axes = tuple(-1 if mark else None for mark in marks)
         found = jax.vmap(functools.partial(_bound, eqn, eqn.params), axes, -1)(*xs)

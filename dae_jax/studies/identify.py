@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,8 +18,10 @@ from ..solution import AccuracyWarning
 from ..types import BoolScalar, DType, Scalar
 from ..validate.states import NUMBERS, brief, describe
 from .identified import Identified, named
-from .least_squares import Factors, Minimum, factors, minimum
 
+
+if TYPE_CHECKING:  # a seventh of the time that importing the library takes beyond diffrax
+    from .least_squares import Factors, Minimum
 
 # A positive parameter that has fallen to this part of its start is on its way to 0.
 LOST = 1e-6
@@ -126,6 +128,8 @@ def _identified(
     tolerance: float,
 ) -> tuple[Identified, Failed]:
     """What was found, and whether it is no minimum."""
+    from .least_squares import minimum
+
     p, unravel = ravel_pytree(params)
     measured, unravel_data = ravel_pytree(data)
     dtype = min((leaf.dtype for leaf in jax.tree.leaves(params)), key=lambda dtype: jnp.finfo(dtype).bits)
@@ -164,9 +168,11 @@ def _identified(
 
 
 def _statistics(
-    end: Minimum, params: PyTree, in_log: Bool[np.ndarray, " p"], known: bool, unit: Scalar | float
+    end: "Minimum", params: PyTree, in_log: Bool[np.ndarray, " p"], known: bool, unit: Scalar | float
 ) -> Identified:
     """All but the residuals in units of the data. `unit`: that of the residuals."""
+    from .least_squares import factors
+
     values, unravel = ravel_pytree(params)
     r, jacobian = end.residual, end.jacobian
     # With fewer data than parameters, directions that no datum sees have no row.
@@ -202,7 +208,7 @@ def _statistics(
     )
 
 
-def _inverse(found: Factors) -> Float[Array, "p p"]:
+def _inverse(found: "Factors") -> Float[Array, "p p"]:
     """(JᵀJ)⁻¹ in units of J's columns; of parameters in a combination that is not seen ∞, and NaN beside others."""
     seen, v = found.seen > 0, found.vt.T
     inverse = (v * jnp.where(seen, 1 / jnp.where(seen, found.s, 1) ** 2, 0)) @ v.T
