@@ -180,8 +180,8 @@ def consistent_state(
 
 def consistent_after(system: System, t: Time, y: State, args: Args, fixed: State) -> Any:
     """The nearest consistent state to one that a reset has made. Of a system that is no mechanism, variables whose derivative occurs in
-    the equations are what they were set to, where the others can be such that all is consistent: who lets a ball bounce does not say
-    what becomes of a contact's force, and no part of the way to that is one of its velocity.
+    the equations alone count for the distance, if they move less so: who lets a ball bounce does not say what becomes of a contact's
+    force, and no part of the way to that is one of its velocity.
     """
     return _consistent(system, t, y, args, fixed, keeps=True)
 
@@ -244,17 +244,25 @@ def _nearest_of_any(
     t = jnp.asarray(t, values.dtype)
     ode = StructuralODE.of(form, values.dtype, complete=True)
     rates = None if rates is None else form.encode(rates)
+    freedom = jnp.where(form.encode(masks), 0, 1)
 
-    def nearest(ode: StructuralODE, values: Flat, freedom: Float[Array, " n"]) -> tuple[Flat, Unsolved]:
-        y = ode.start(t, values, freedom, rates)
+    def nearest(ode: StructuralODE, values: Flat, counted: Bool[Array, " n"]) -> tuple[Flat, Unsolved]:
+        y = ode.start(t, values, freedom, rates, counted)
         return y, _left_over(ode, t, y, values, jnp.zeros_like(t))
 
-    freedom = jnp.where(form.encode(masks), 0, 1)
+    counted = jnp.ones(values.shape, bool)
     if keeps:
-        of_others = jnp.where(LinearisedResidual.of(form, values).structure.differential, 0, freedom)
-        _, remains = nearest(*constant((ode, values, of_others)))
-        freedom = jnp.where(remains.consistent(), of_others, freedom)
-    y, remains = nearest(ode, values, freedom)
+        held, own = constant((ode, values)), jnp.asarray(LinearisedResidual.of(form, values).structure.differential)
+
+        def moved(counted: Bool[Array, " n"]) -> Float[Array, ""]:
+            y, remains = nearest(*held, counted)
+            way = jnp.where(own, form.encode(ode.decode(t, y)) - held[1], 0)
+            return jnp.where(remains.consistent(), jnp.max(jnp.abs(way), initial=0), jnp.inf)
+
+        # Where others cannot follow, as z of x² + z² = 1 from 0, there may be no such state, or one farther off.
+        kept, alike = jax.lax.map(moved, jnp.stack([own, counted]))
+        counted = jnp.where(kept <= alike, own, counted)
+    y, remains = nearest(ode, values, counted)
     fine = remains.consistent()
     return jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), ode.decode(t, y)), fine, remains
 

@@ -46,8 +46,8 @@ class Reset(eqx.Module):
     - `condition(t, y, args, **kwargs)`: a real number; an event is where it crosses zero, located on the solver's dense
       output.
     - `reset(t, y, args) -> (y, args)`: the state and the `args` that the solve goes on with. The nearest consistent state to
-      it is taken, in the sense of `consistent_state`; of a `SemiExplicitDAE` or an `ImplicitDAE` such that variables whose derivative
-      occurs in the equations keep what they are set to, if the others (multipliers, currents) can be consistent with them.
+      it is taken, in the sense of `consistent_state`; of a `SemiExplicitDAE` or an `ImplicitDAE` variables whose derivative occurs in
+      the equations keep what they are set to, if the others (multipliers, currents) can be consistent with them.
     - `direction`: `True` for upcrossings only, `False` for downcrossings only, in the direction in which the solve goes.
     - `fixed`: entries of the state that are kept when it is made consistent, as in `consistent_state`.
     - `max_resets`: how many there may be; one more ends the solve with `RESULTS.too_many_jumps`, and so do resets that pile

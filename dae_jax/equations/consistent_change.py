@@ -46,7 +46,10 @@ def consistent_change(system: System, t: Time, y: State, change: State, args: Ar
     a = ode.normals(t, at)
     of_form = lambda system, args: dataclasses.replace(ode, form=ResidualForm.of(system, t, y, args)).violations(t, at)
     found = aim + step_to(
-        a, jnp.sum(a * aim, 1) + push(of_form), jnp.asarray(np.where(is_value, 1, FREE), aim.dtype), ~is_value
+        a,
+        jnp.sum(a * aim, 1) + push(of_form),
+        jnp.asarray(np.where(is_value, 1, FREE), aim.dtype),
+        jnp.asarray(~is_value),
     )
     return jax.jvp(lambda y: ode.decode(t, y), (at,), (found,))[1]
 

@@ -1,7 +1,6 @@
 """The shortest way to the solutions of linear equations for values and derivatives, of which the derivatives cost nothing."""
 
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
@@ -10,7 +9,7 @@ from ..types import IntScalar
 
 
 def step_to(
-    a: Float[Array, "m n"], off: Float[Array, " m"], weights: Float[Array, " n"], derivatives: Bool[np.ndarray, " n"]
+    a: Float[Array, "m n"], off: Float[Array, " m"], weights: Float[Array, " n"], derivatives: Bool[Array, " n"]
 ) -> Float[Array, " n"]:
     """x with A x = −`off`, in which the values, counted as 1/`weights`, are as short as can be; an entry of weight 0 stays.
 
@@ -42,8 +41,7 @@ def step_to(
         return a, off, jnp.where(changed & at_column, 1.0, pivots)
 
     none = jnp.zeros_like(a)
-    most = min(m, int(derivatives.sum()))
-    a, off, pivots = lax.fori_loop(0, most, eliminate, (a * scale[:, None], off * scale, none))
+    a, off, pivots = lax.fori_loop(0, min(a.shape), eliminate, (a * scale[:, None], off * scale, none))
     solved = jnp.sum(pivots, 1)
     rest = jnp.where(free, 0, a * weights) * (1 - solved)[:, None]
     size = largest(rest)

@@ -75,14 +75,16 @@ class SparseInvariants:
         y: Float[Array, " N"],
         start: Float[Array, " N"],
         weights: Float[Array, " N"],
+        derivatives: Bool[Array, " N"],
     ) -> Float[Array, " N"]:
-        """The point next to `start` on the linearisation of H = 0 at Y, in the metric in which entries count as 1/`weights`.
+        """The point next to `start` on the linearisation of H = 0 at Y, in the metric in which entries count as 1/`weights`,
+        `derivatives` for little.
 
         By the shortest u = (start − Y)/weights with S u = b, rows of length 1.
         """
         a, h = self.entries(ode, t, y), ode.violations(t, y)
         b = h + self.row_sums(a * (start - y)[self.columns])
-        weights = self._by_speed(a, weights, ode.orders.values < 0)
+        weights = self._by_speed(a, weights, derivatives)
         s = a * weights[self.columns]
         scale = scaling(jnp.sqrt(self.row_sums(s * s)))
         s, b = s * scale[self.rows], b * scale
@@ -91,7 +93,7 @@ class SparseInvariants:
         return start - weights * u
 
     def _by_speed(
-        self, a: Float[Array, " entries"], weights: Float[Array, " N"], derivatives: Bool[np.ndarray, " N"]
+        self, a: Float[Array, " entries"], weights: Float[Array, " N"], derivatives: Bool[Array, " N"]
     ) -> Float[Array, " N"]:
         """The weights, those of derivatives so large that in each equation a derivative moves before a value, however fast the dynamics
         are.

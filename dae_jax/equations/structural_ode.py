@@ -317,14 +317,17 @@ class StructuralODE(ManifoldODE):
         values: Float[Array, " n"],
         freedom: Float[Array, " n"] | None,
         rates: Float[Array, " n"] | None = None,
+        counted: Bool[Array, " n"] | None = None,
     ) -> Float[Array, " N"]:
         """Y near the values of the variables, each of which may move as much as its `freedom` says (0: not at all; 1: no
-        more than the others; `None`: none moves), with the least H. Gauss–Newton's method; the derivatives from 0, the first ones from what
-        is known of them or, where F is nonlinear in them, from such as satisfy it; these are `rates` where that is given.
+        more than the others; `None`: none moves), with the least H; those that are not `counted` (`None`: all are) move for nothing.
+        Gauss–Newton's method; the derivatives from 0, the first ones from what is known of them or, where F is nonlinear in them, from
+        such as satisfy it; these are `rates` where that is given.
         """
-        index = self.orders.values
-        weights = jnp.asarray(np.where(index < 0, FREE, 0), values.dtype)
-        weights = weights if freedom is None else weights + take(freedom.astype(values.dtype), index)
+        index, one = self.orders.values, jnp.ones_like(values)
+        moves = take(0 * one if freedom is None else freedom.astype(values.dtype), index)
+        counts = take(one if counted is None else counted.astype(values.dtype), index)
+        weights = jnp.where(counts > 0, moves, jnp.where(jnp.asarray(index < 0) | (moves > 0), FREE, 0))
         known = take(values, index)
         first = self.orders.first_derivatives
         if rates is not None:
@@ -334,23 +337,27 @@ class StructuralODE(ManifoldODE):
         else:
             rates = self.form.known_rates(values)
         known = known + take(rates, first)
-        return _nearest(self, t, known, weights, freedom is not None)
+        return _nearest(self, t, known, weights, counts, freedom is not None)
 
 
 def _nearest(
-    ode: StructuralODE, t: Time, known: Float[Array, " N"], weights: Float[Array, " N"], values_move: bool
+    ode: StructuralODE,
+    t: Time,
+    known: Float[Array, " N"],
+    weights: Float[Array, " N"],
+    counts: Float[Array, " N"],
+    values_move: bool,
 ) -> Any:
     if not any(ode.orders.equations):
         return known
-    is_value = ode.orders.values >= 0
 
     def moved(y: Float[Array, " N"], aim: Float[Array, " N"], params: PyTree) -> Any:
         """The point next to `aim` on the linearisation of H = 0 at y."""
-        ode, t, _, weights, *_ = params
+        ode, t, _, weights, counts, *_ = params
         if ode.sparse is not None:
-            return ode.sparse.nearest(ode, t, y, aim, weights)
+            return ode.sparse.nearest(ode, t, y, aim, weights, counts == 0)
         a, h = ode.normals(t, y), ode.violations(t, y)
-        return aim + step_to(a, h + jnp.sum(a * (aim - y), 1), weights, ~is_value)
+        return aim + step_to(a, h + jnp.sum(a * (aim - y), 1), weights, counts == 0)
 
     def settled(y: Float[Array, " N"], aims: Callable[[Array], Array], params: PyTree) -> Any:
         def correct(y: Float[Array, " N"]) -> Any:
@@ -359,11 +366,11 @@ def _nearest(
 
         return fixed_point(correct, y, max_steps=STARTING)
 
-    given = ode, t, known, weights
+    given = ode, t, known, weights, counts
     held = constant(given)
-    start, measured = held[2], is_value & (weights > 0)
+    start, measured = held[2], (held[4] > 0) & (held[3] > 0)
     # Derivatives have nothing to be near to but what the equations make of them.
-    aims = lambda y: jnp.where(is_value, start, y)
+    aims = lambda y: jnp.where(held[4] > 0, start, y)
     if not values_move:
         first = start
     elif ode.sparse is not None:
@@ -376,9 +383,9 @@ def _nearest(
     params = (*given, first)
     # A little of a pull keeps the derivatives that the equations leave open from being undetermined.
     pull = jnp.finfo(known.dtype).eps ** 0.6
-    aim = lambda y, params: jnp.where(is_value, params[2], y - pull * (y - params[4]))
+    aim = lambda y, params: jnp.where(params[4] > 0, params[2], y - pull * (y - params[5]))
     # From the nearest point on, what `cut` has left of H there.
-    iterate = lambda params: settled(params[4], lambda y: y, params)
+    iterate = lambda params: settled(params[5], lambda y: y, params)
     return implicit_root(
         lambda y, p: y - moved(y, aim(y, p), p), iterate, params, jacobian=_by_y if ode.sparse else None
     )[0]
