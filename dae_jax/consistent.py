@@ -252,11 +252,14 @@ def _nearest_of_any(
 
     counted = jnp.ones(values.shape, bool)
     if keeps:
-        held, own = constant((ode, values)), jnp.asarray(LinearisedResidual.of(form, values).structure.differential)
+        (still, held), own = (
+            constant((ode, values)),
+            jnp.asarray(LinearisedResidual.of(form, values).structure.differential),
+        )
 
         def moved(counted: Bool[Array, " n"]) -> Float[Array, ""]:
-            y, remains = nearest(*held, counted)
-            way = jnp.where(own, form.encode(ode.decode(t, y)) - held[1], 0)
+            y, remains = nearest(still, held, counted)
+            way = jnp.where(own, form.encode(ode.decode(t, y)) - held, 0)
             return jnp.where(remains.consistent(), jnp.max(jnp.abs(way), initial=0), jnp.inf)
 
         # Where others cannot follow, as z of x² + z² = 1 from 0, there may be no such state, or one farther off.

@@ -1,6 +1,7 @@
 """Whether a sparse matrix is nonsingular to round-off."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array
@@ -59,7 +60,7 @@ def _condition(matrix: csr_array) -> float:
     except RuntimeError:
         return np.inf
     transposed = lambda x: factors.solve(x, "T")
-    inverse = LinearOperator(
-        factors.shape, factors.solve, transposed, matmat=factors.solve, rmatmat=transposed, dtype=np.dtype(float)
-    )
+    # One of functions, of which scipy's types know nothing.
+    operator: Any = LinearOperator
+    inverse = operator(factors.shape, factors.solve, transposed, matmat=factors.solve, rmatmat=transposed, dtype=float)
     return float(abs(matrix).sum(0).max() * onenormest(inverse))
