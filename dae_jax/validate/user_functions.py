@@ -140,8 +140,10 @@ def returned(call: str, function: Callable[..., Any], *values: State) -> Any:
             "`jnp.where` in place of numpy, `math`, `float` and `if`."
         ) from error
     except Exception as error:
+        left_out = call.endswith("args)") and values[-1] is None and "NoneType" in str(error)
         raise ValueError(
             f"`{call}` fails with {', '.join(_named(call, values))}: {type(error).__name__}: {_first_line(error)}."
+            f"{' No `args` were given: pass `args=...`.' if left_out else ''}"
         ) from error
     if _numbers_in(jaxpr) != _numbers_in(again):
         raise ValueError(

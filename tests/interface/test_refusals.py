@@ -97,7 +97,7 @@ FUNCTIONS = {
     "force and constraint swapped": (mechanism(lambda t, q, a: q @ q, lambda t, q, v, a: q), "`force(t, q, v, args)` must take these arguments, but the function given takes (t, q, a)"),
     "force is no function": (mechanism("gravity"), "`force` must be a function, but is 'gravity'."),
     "args in words": (lambda: solve(D.ConstrainedSystem(lambda t, q, v, a: a * q, constraint), args="9.81"), "`force(t, q, v, args)` fails with q: float64[2], v: float64[2], args: '9.81': TypeError"),
-    "args left out": (lambda: solve(D.ConstrainedSystem(lambda t, q, v, a: a["g"] * q, constraint)), "`force(t, q, v, args)` fails with q: float64[2], v: float64[2], args: None: TypeError"),
+    "args left out": (lambda: solve(D.ConstrainedSystem(lambda t, q, v, a: a["g"] * q, constraint)), "`force(t, q, v, args)` fails with q: float64[2], v: float64[2], args: None: TypeError: 'NoneType' object is not subscriptable. No `args` were given: pass `args=...`."),
     "args without a key": (lambda: solve(D.ConstrainedSystem(lambda t, q, v, a: a["g"] * q, constraint), args={"k": 1.0}), "args: {'k': float64[]}: KeyError: 'g'."),
     "constraint of a list": (mechanism(constraint=lambda t, q, a: [q @ q - 1]), "`constraint(t, q, args)` must return a number or a vector, one entry a constraint, but returns [float64[]]: put the constraints together with `jnp.stack([...])`"),
     "constraint of a pair": (mechanism(constraint=lambda t, q, a: (q[0] - 1, q[1])), "one entry a constraint, but returns (float64[], float64[])"),

@@ -55,6 +55,12 @@ def test_dense_output_anywhere_in_any_way():
     assert jnp.isnan(sol.evaluate(1.5)[0]).all()
 
 
+def test_dense_output_and_no_saved_states():
+    sol = solve(saveat=diffrax.SaveAt(dense=True))
+    assert sol.ys is None
+    np.testing.assert_allclose(sol.evaluate(0.5)[0], SCENE.reference(np.array([0.5]))[0][0], atol=1e-7)
+
+
 @pytest.mark.parametrize("way", [lambda x: pickle.loads(pickle.dumps(x)), copy.deepcopy], ids=["pickle", "deepcopy"])
 def test_a_solution_can_be_copied(way):
     sol = solve(saveat=diffrax.SaveAt(ts=np.linspace(0, 1, 5)))
