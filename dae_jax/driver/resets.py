@@ -61,6 +61,10 @@ class Reset(eqx.Module):
     fails with `RESULTS.undetermined_side`. What a reset has brought to rest and is pulled through zero again is reset again: it fails
     with `RESULTS.too_many_jumps`. Of a time to save at that is that of a reset but for round-off, the state is that before or
     after it.
+
+    A reset may change in `args` which equations hold. Where it changes their index, as an ideal diode that closes or opens does beside
+    a coil, `RadauIIA5` and `BDF` go on, but derivatives after it are NaN, and solvers by way of the underlying ODE stop there: write a
+    small and a large resistance in place of the ideal switch.
     """
 
     condition: Callable[..., Any]
