@@ -20,13 +20,12 @@ def without_stop(sol: DAESolution, saveat: diffrax.SaveAt) -> DAESolution:
     """The solution without what `SaveAt(t1=True)` has of a solve that failed: the state at which it stopped, which is `sol.end`, would
     pass for that at t1.
     """
+    if sol.ts is None:  # of `SaveAt(dense=True)`
+        return sol
     okay = (sol.result == RESULTS.successful) | (sol.result == RESULTS.event_occurred)
     structure = jax.tree.structure(saveat.subs, is_leaf=is_saved_part)
     parts = zip(*map(structure.flatten_up_to, (saveat.subs, sol.ts, sol.ys)), strict=True)
-    kept = [_without_stop(part, okay, t, y) for part, t, y in parts]
-    if not kept:  # `SaveAt(dense=True)` saves no states
-        return sol
-    ts, ys = zip(*kept, strict=True)
+    ts, ys = zip(*[_without_stop(part, okay, t, y) for part, t, y in parts], strict=True)
     return dataclasses.replace(sol, ts=structure.unflatten(ts), ys=structure.unflatten(ys), given=sol.given)
 
 
