@@ -105,7 +105,9 @@ def refuse_no_solver(solver: object) -> None:
     """Refuses what is no solver of ODEs or of residuals."""
     if not isinstance(solver, diffrax.AbstractSolver):
         other = ": give it as `formulation`" if isinstance(solver, AbstractFormulation) else ""
-        raise TypeError(f"`solver` must be a diffrax solver such as diffrax.Tsit5(), but is {brief(solver)}{other}.")
+        raise TypeError(
+            f"`solver` must be one of dae_jax or of diffrax, such as OrthogonalProjection(DOP853()), RadauIIA5() or diffrax.Tsit5(), but is {brief(solver)}{other}."
+        )
     if not (takes_residuals(solver) or _takes_one_ode(solver.term_structure)):
         raise ValueError(
             f"`solver` must be one for ẏ = f(t, y), but {type(solver).__name__} needs equations that are split or have noise: "

@@ -164,9 +164,9 @@ STATES = {
 
 
 METHODS = {
-    "solver a class": (given(solver=diffrax.Tsit5), "`solver` must be a diffrax solver such as diffrax.Tsit5(), but is the class Tsit5: write Tsit5(...)."),
+    "solver a class": (given(solver=diffrax.Tsit5), "`solver` must be one of dae_jax or of diffrax, such as OrthogonalProjection(DOP853()), RadauIIA5() or diffrax.Tsit5(), but is the class Tsit5: write Tsit5(...)."),
     "our solver a class": (given(solver=D.RadauIIA5), "but is the class RadauIIA5: write RadauIIA5(...)."),
-    "solver of None": (given(solver=None), "`solver` must be a diffrax solver such as diffrax.Tsit5(), but is None."),
+    "solver of None": (given(solver=None), "`solver` must be one of dae_jax or of diffrax, such as OrthogonalProjection(DOP853()), RadauIIA5() or diffrax.Tsit5(), but is None."),
     "solver a formulation": (given(solver=D.Baumgarte(1.0, 1.0)), ": give it as `formulation`."),
     "formulation a solver": (by(RADAU), "`formulation` must be a formulation such as dae_jax.Baumgarte(...), but is RadauIIA5(): give it as `solver`."),
     "formulation a class": (lambda: solve(formulation=D.Baumgarte), "but is the class Baumgarte: write Baumgarte(...)."),
