@@ -252,15 +252,13 @@ def _nearest_of_any(
 
     counted = jnp.ones(values.shape, bool)
     if keeps:
-        (still, held), own = (
-            constant((ode, values)),
-            jnp.asarray(LinearisedResidual.of(form, values).structure.differential),
-        )
+        still, held = constant((ode, values))
+        own = jnp.asarray(LinearisedResidual.of(form, values).structure.differential)
 
         def moved(counted: Bool[Array, " n"]) -> Float[Array, ""]:
             y, remains = nearest(still, held, counted)
             way = jnp.where(own, form.encode(ode.decode(t, y)) - held, 0)
-            return jnp.where(remains.consistent(), jnp.max(jnp.abs(way), initial=0), jnp.inf)
+            return jnp.where(remains.consistent(), jnp.sum(way**2), jnp.inf)
 
         # Where others cannot follow, as z of x² + z² = 1 from 0, there may be no such state, or one farther off.
         kept, alike = jax.lax.map(moved, jnp.stack([own, counted]))

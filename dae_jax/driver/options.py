@@ -106,7 +106,8 @@ def refuse_no_solver(solver: object) -> None:
     if not isinstance(solver, diffrax.AbstractSolver):
         other = ": give it as `formulation`" if isinstance(solver, AbstractFormulation) else ""
         raise TypeError(
-            f"`solver` must be one of dae_jax or of diffrax, such as OrthogonalProjection(DOP853()), RadauIIA5() or diffrax.Tsit5(), but is {brief(solver)}{other}."
+            "`solver` must be one of dae_jax or of diffrax, such as OrthogonalProjection(DOP853()), RadauIIA5() or diffrax.Tsit5(), but is "
+            f"{brief(solver)}{other}."
         )
     if not (takes_residuals(solver) or _takes_one_ode(solver.term_structure)):
         raise ValueError(

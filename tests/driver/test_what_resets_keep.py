@@ -82,3 +82,15 @@ def test_what_cannot_be_kept_is_as_near_as_can_be():
     x, y, *speeds, _ = sol.ys[1]
     assert x**2 + y**2 == pytest.approx(1, abs=1e-9)
     assert (speeds[0] ** 2 + speeds[1] ** 2) / 2 + 9.81 * y == pytest.approx(way(nearest)[1], rel=1e-6)
+
+
+def test_of_two_states_the_nearer_in_what_is_kept_is_taken():
+    """From (0, 0) to 3 x + y = 10: (3, 1) is nearest; (2.5, 2.5), where z = 10 (x − y) is as it was, is less off in x alone."""
+    a = jnp.array([3.0, 1.0])
+    system = dae_jax.SemiExplicitDAE(
+        lambda t, x, z, args: -a * z[0], lambda t, x, z, args: jnp.stack([a @ x - 10, z[1] - 10 * (x[0] - x[1])])
+    )
+    event = dae_jax.Reset(lambda t, y, args, **kwargs: t - 0.5, lambda t, y, args: ((jnp.zeros(2), jnp.zeros(2)), args))
+    start = (jnp.array([3.0, 1.0]), jnp.array([0.0, 20.0]))
+    found = dae_jax.daesolve(system, dae_jax.RadauIIA5(), 0.0, 1.0, None, start, event=event).ys[0][0]
+    np.testing.assert_allclose(found, [3, 1], rtol=1e-7)
