@@ -274,7 +274,9 @@ class Solve:
             with settled(program.leaves):
                 solve, problem = program.whole(arrays)
                 given, rest = changing(solve, problem)
-                solve = dataclasses.replace(solve, adjoint=OneDirection(solve.between()), saveat=saveat)
+                # Of solvers of residuals the error between steps counts, if points there are asked for.
+                between = solve.between() and takes_residuals(solve.solver)
+                solve = dataclasses.replace(solve, adjoint=OneDirection(between), saveat=saveat)
                 solved = lambda given: steps_of(*with_changes(solve, problem, eqx.combine(given, rest)), failed)
                 return by_felt_steps(solved, given, changes)
 
