@@ -99,7 +99,7 @@ def test_under_vmap_the_healthy_elements_survive():
     [
         ({"dt0": -0.1}, "sign of t1"),
         ({"t1": float("inf")}, "finite"),
-        ({"solver": "tsit5"}, "diffrax solver"),
+        ({"solver": "tsit5"}, "one of dae_jax or of diffrax"),
         ({"formulation": "baumgarte"}, "formulation"),
         ({"solver": dae_jax.RATTLE()}, "`dt0` must be given"),
         (
