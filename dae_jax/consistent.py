@@ -251,9 +251,8 @@ def _nearest_of_any(
         return y, _left_over(ode, t, y, values, jnp.zeros_like(t))
 
     counted = jnp.ones(values.shape, bool)
-    if keeps:
+    if keeps and not (own := LinearisedResidual.of(form, values).structure.differential).all():
         still, held = constant((ode, values))
-        own = jnp.asarray(LinearisedResidual.of(form, values).structure.differential)
 
         def moved(counted: Bool[Array, " n"]) -> Float[Array, ""]:
             y, remains = nearest(still, held, counted)

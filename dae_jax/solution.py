@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, PyTree, Real
 from ._compat import messages
 from .compiler import at_ease, quickly_compiled
 from .tables import table
-from .types import Args, DType, State, Time
+from .types import Args, BoolScalar, DType, State, Time
 
 
 # What shows a solution lies on a floor above: the package registers it here, by name.
@@ -298,6 +298,11 @@ def _last(ts: Float[Array, "*batch times"], ys: State) -> Any:
         return jax.vmap(_last)(ts, ys)
     last = last_saved(ts)
     return jax.tree.map(lambda y: y[last], ys)
+
+
+def went_well(result: Any) -> BoolScalar:
+    """Whether a solve came to its end, or an event ended it."""
+    return (result == RESULTS.successful) | (result == RESULTS.event_occurred)
 
 
 def last_saved(ts: Float[Array, " times"]) -> Any:

@@ -23,7 +23,7 @@ from ..equations.manifold_ode import constant
 from ..equations.mechanical import MechanicalODE
 from ..equations.residual_form import ResidualForm
 from ..equations.singular_block import singular_block
-from ..solution import RESULTS, DAESolution
+from ..solution import RESULTS, DAESolution, went_well
 from ..systems import is_mechanism
 from ..types import BoolScalar
 from ..validate.user_functions import not_finite
@@ -170,7 +170,7 @@ def raised_in_the_program(sol: DAESolution, problem: Problem, off: Violation | N
     """`sol` of a problem, in a program in which it raises a `SolveFailed` where it is evaluated and has failed; `off`: how far its
     start is from the constraints, if that is known.
     """
-    okay = jnp.any(jnp.stack([sol.result._value == code for code in OKAY]))
+    okay = went_well(sol.result)
     arrays, rest = eqx.partition(sol, eqx.is_array)
     details = jax.tree.map(jnp.asarray, lax.stop_gradient(_details(sol)))
     find, numbers = _as_it_is, off

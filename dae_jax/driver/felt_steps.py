@@ -9,7 +9,6 @@ from collections.abc import Callable
 from typing import Any
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -27,11 +26,7 @@ SMALL = 1e-6
 
 
 class OneDirection(diffrax.ForwardMode):
-    """Forward derivatives along one direction, by steps that are short enough for it: those of the solution are the same. `between`:
-    whether points between steps will be asked for, where what the solve itself saves does not say so.
-    """
-
-    between: bool = eqx.field(static=True, default=False)
+    """Forward derivatives along one direction, by steps that are short enough for it: those of the solution are the same."""
 
 
 def by_felt_steps(solved: Callable[[Any], tuple[Steps, BoolScalar]], given: Any, changes: Any) -> Steps:

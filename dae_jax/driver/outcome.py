@@ -9,11 +9,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, PyTree
 
-from ..solution import RESULTS, DAESolution, all_finite, precision_of
+from ..solution import RESULTS, DAESolution, all_finite, precision_of, went_well
 from ..solvers import takes_residuals
 from ..types import Scalar, State
 from . import doubts
 from .problem import Problem, count_of
+from .reached import without_rows
 from .start import is_saved_part, saved_parts
 
 
@@ -46,26 +47,23 @@ def judged(
     outside = [_wrong_times(part, problem) for part in saved_parts(solve.saveat) if part.ts is not None]
     if _times_only(solve.saveat):
         # With `throw=False` nobody need look at the code, and these would pass for states.
-        ys = jax.tree.map(functools.partial(_without, outside[0]), ys)
+        ys = jax.tree.map(functools.partial(without_rows, outside[0], jnp.nan), ys)
     precision = precision_of(t0.dtype, solve.controller)
-    went_well = (code == RESULTS.successful) | (code == RESULTS.event_occurred)
-    code = RESULTS.where(went_well & ~jnp.all(jnp.stack([finite_end, *finite])), RESULTS.not_finite, code)
+    code = RESULTS.where(went_well(code) & ~jnp.all(jnp.stack([finite_end, *finite])), RESULTS.not_finite, code)
     # A root finder that met a condition that is not a number ends anywhere, also at a time that is none.
     lost = ~defined | ~jnp.isfinite(stats["end_time"])
     for name in ("nonlinear_max_steps_reached", "nonfinite_input", "nonfinite"):
         code = failed(getattr(RESULTS, name), RESULTS.undefined_condition, lost)
     if solve.event is not None:
         code = failed(RESULTS.nonlinear_max_steps_reached, RESULTS.event_not_located)
-    went_well = (code == RESULTS.successful) | (code == RESULTS.event_occurred)
-    code = RESULTS.where(went_well & ~defined, RESULTS.undefined_condition, code)
+    okay = went_well(code)
+    code = RESULTS.where(okay & ~defined, RESULTS.undefined_condition, code)
     stuck = [getattr(RESULTS, name) for name in _STUCK]
     stuck = jnp.any(jnp.stack([code == name for name in stuck]))
     code = RESULTS.where(stuck & end.singular, RESULTS.singular_configuration, code)
-    code = RESULTS.where(went_well & ~end.near, RESULTS.off_constraints, code)
-    code = RESULTS.where(
-        went_well & jnp.any(jnp.concatenate([jnp.zeros(1, bool), *outside])), RESULTS.times_outside, code
-    )
-    code = RESULTS.where(end.masses & (end.masses_ahead | went_well), code, RESULTS.irregular_mass)
+    code = RESULTS.where(okay & ~end.near, RESULTS.off_constraints, code)
+    code = RESULTS.where(okay & jnp.any(jnp.concatenate([jnp.zeros(1, bool), *outside])), RESULTS.times_outside, code)
+    code = RESULTS.where(end.masses & (end.masses_ahead | okay), code, RESULTS.irregular_mass)
     for wrong, name in enumerate(
         ("inconsistent_start", "dependent_constraints", "irregular_mass", "ambiguous_start"), 1
     ):
@@ -76,10 +74,9 @@ def judged(
     defined = jnp.isfinite(problem.t0) & jnp.isfinite(problem.t1)
     code = RESULTS.where(defined, code, RESULTS.undefined_interval)
     rank = count_of(problem.rank)
-    went_well = (code == RESULTS.successful) | (code == RESULTS.event_occurred)
     stats = {
         **stats,
-        "doubts": jnp.where(went_well, doubts.found(solve, end.drifted, stats["num_accepted_steps"], *seen), 0),
+        "doubts": jnp.where(went_well(code), doubts.found(solve, end.drifted, stats["num_accepted_steps"], *seen), 0),
     }
     return DAESolution(t0, t1, ts, ys, interpolation, stats, code, event_mask, problem.args, rank, precision, end=ended)
 
@@ -106,10 +103,3 @@ def _times_only(saveat: diffrax.SaveAt) -> bool:
     """Whether `SaveAt(ts=...)` is all that is saved, so that states are along `ts`."""
     part = saveat.subs
     return is_saved_part(part) and part.ts is not None and not (part.t0 or part.t1 or part.steps)
-
-
-def _without(wrong: Bool[Array, " times"], y: Array) -> Array:
-    """NaN in the rows that are wrong."""
-    if not jnp.issubdtype(y.dtype, jnp.inexact):
-        return y
-    return jnp.where(wrong.reshape(-1, *[1] * (y.ndim - 1)), jnp.nan, y)

@@ -119,7 +119,7 @@ def run(program: Program, arrays: Arrays) -> tuple[DAESolution, Start, float]:
 @functools.partial(
     jax.tree_util.register_dataclass,
     data_fields=("formulation", "solver", "saveat", "controller", "adjoint", "event", "progress_meter"),
-    meta_fields=("max_steps", "throw", "recording"),
+    meta_fields=("max_steps", "throw", "recording", "counts_between"),
 )
 @dataclasses.dataclass(frozen=True, eq=False)
 class Solve:
@@ -137,6 +137,8 @@ class Solve:
     throw: bool = False
     # Whether the dense output is there for the tape alone.
     recording: bool = False
+    # Whether steps are to be good between their ends though nothing is saved there.
+    counts_between: bool = False
 
     def __call__(self, problem: Problem) -> tuple[DAESolution, Start]:
         backwards = problem.t1 < problem.t0
@@ -276,7 +278,7 @@ class Solve:
                 given, rest = changing(solve, problem)
                 # Of solvers of residuals the error between steps counts, if points there are asked for.
                 between = solve.between() and takes_residuals(solve.solver)
-                solve = dataclasses.replace(solve, adjoint=OneDirection(between), saveat=saveat)
+                solve = dataclasses.replace(solve, adjoint=OneDirection(), saveat=saveat, counts_between=between)
                 solved = lambda given: steps_of(*with_changes(solve, problem, eqx.combine(given, rest)), failed)
                 return by_felt_steps(solved, given, changes)
 
@@ -338,8 +340,7 @@ class Solve:
         return self.saves_steps() and self.has_derivative_apart()
 
     def between(self) -> bool:
-        """Whether points between steps are asked for, or of a derivative's steps will be."""
-        if isinstance(self.adjoint, OneDirection) and self.adjoint.between:
-            return True
+        """Whether points between steps are asked for, or count."""
         at_times = any(part.ts is not None for part in saved_parts(self.saveat))
-        return (self.saveat.dense and not self.recording) or at_times or self.event is not None
+        dense = self.saveat.dense and not self.recording
+        return self.counts_between or dense or at_times or self.event is not None

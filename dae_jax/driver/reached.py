@@ -1,6 +1,7 @@
 """Which of the saved values are answers: those of times that the solve has reached, and only these have derivatives."""
 
 import dataclasses
+import functools
 from typing import Any
 
 import diffrax
@@ -9,9 +10,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Bool, PyTree
 
-from ..solution import RESULTS, DAESolution, last_saved
+from ..solution import DAESolution, last_saved, went_well
 from ..types import BoolScalar
 from .start import is_saved_part
 
@@ -22,7 +23,7 @@ def without_stop(sol: DAESolution, saveat: diffrax.SaveAt) -> DAESolution:
     """
     if sol.ts is None:  # of `SaveAt(dense=True)`
         return sol
-    okay = (sol.result == RESULTS.successful) | (sol.result == RESULTS.event_occurred)
+    okay = went_well(sol.result)
     structure = jax.tree.structure(saveat.subs, is_leaf=is_saved_part)
     parts = zip(*map(structure.flatten_up_to, (saveat.subs, sol.ts, sol.ys)), strict=True)
     ts, ys = zip(*[_without_stop(part, okay, t, y) for part, t, y in parts], strict=True)
@@ -42,13 +43,14 @@ def _without_stop(part: diffrax.SubSaveAt, okay: BoolScalar, ts: Any, ys: Any) -
     if not part.t1 or part.steps:
         return ts, ys
     gone = ~okay & (jnp.arange(ts.size) == last_saved(ts))
+    return jax.tree.map(functools.partial(without_rows, gone, jnp.inf), (ts, ys))
 
-    def without(x: Array) -> Array:
-        if not jnp.issubdtype(x.dtype, jnp.inexact):
-            return x
-        return jnp.where(gone.reshape(-1, *[1] * (x.ndim - 1)), jnp.inf, x)
 
-    return without(ts), jax.tree.map(without, ys)
+def without_rows(rows: Bool[Array, " times"], instead: float, x: Array) -> Array:
+    """`instead` in these rows of saved numbers; integers have none."""
+    if not jnp.issubdtype(x.dtype, jnp.inexact):
+        return x
+    return jnp.where(rows.reshape(-1, *[1] * (x.ndim - 1)), instead, x)
 
 
 @jax.custom_jvp

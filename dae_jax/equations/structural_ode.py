@@ -324,9 +324,9 @@ class StructuralODE(ManifoldODE):
         Gauss–Newton's method; the derivatives from 0, the first ones from what is known of them or, where F is nonlinear in them, from
         such as satisfy it; these are `rates` where that is given.
         """
-        index, one = self.orders.values, jnp.ones_like(values)
-        moves = take(0 * one if freedom is None else freedom.astype(values.dtype), index)
-        counts = take(one if counted is None else counted.astype(values.dtype), index)
+        index, dtype = self.orders.values, values.dtype
+        moves = take(jnp.zeros_like(values) if freedom is None else freedom.astype(dtype), index)
+        counts = take(jnp.ones_like(values) if counted is None else counted.astype(dtype), index)
         weights = jnp.where(counts > 0, moves, jnp.where(jnp.asarray(index < 0) | (moves > 0), FREE, 0))
         known = take(values, index)
         first = self.orders.first_derivatives

@@ -140,8 +140,8 @@ def _at_known_places(context: Context, x: View, indices: np.ndarray, p: Params, 
         return View(x.dtype, shape, x.buffer, strides, code.plus(x.offset, int(places[(0,) * places.ndim])))
     # Along axes of even steps places are worked out: the last may be in vectors that lie together.
     steps = [_step(places, axis) if inside else None for axis in range(places.ndim)]
-    origin = places[tuple(slice(None) if step is None else slice(1) for step in steps)]
-    table = context.memory.constant_view(np.where(order >= 0, places, -1) if not inside else origin)
+    own = tuple(slice(None) if step is None else slice(1) for step in steps)
+    table = context.memory.constant_view(np.where(order >= 0, places, -1)[own])
 
     def read(index: Sequence[Index]) -> Any:
         if not any(isinstance(i, Value) for i in index):
