@@ -123,7 +123,7 @@ def unsolved(system: System, t: Time, state: State, args: Args, way: tuple[State
         ode = StructuralODE.of(form, y.dtype, complete=True)
         return _left_over(ode, t, ode.encode(t, state), start, span)
     several = rates_of(form, t, y)[1] if is_nonlinear(form, y.dtype) else jnp.asarray(False)
-    yd = linearised.rates(t, y)
+    yd = linearised.ydot(t, y)
     j, m = linearised.jacobians(t, y, yd)
     apply, root = linearised.storage.apply, jnp.finfo(y.dtype).eps ** 0.5
     largest = _on_the_way(y, start, yd, span)
@@ -135,15 +135,15 @@ def unsolved(system: System, t: Time, state: State, args: Args, way: tuple[State
 def _left_over(ode: StructuralODE, t: Time, y: Float[Array, " N"], start: Flat, span: Time) -> Unsolved:
     root = jnp.finfo(y.dtype).eps ** 0.5
     # Derivatives of the highest order are not in the state.
-    rates = take(jnp.concatenate([y, jnp.zeros_like(start)]), ode.orders.derivatives)
-    largest = _on_the_way(y, take(start, ode.orders.values), rates, span)
+    ydot = take(jnp.concatenate([y, jnp.zeros_like(start)]), ode.orders.derivatives)
+    largest = _on_the_way(y, take(start, ode.orders.values), ydot, span)
     own, on_the_way = ode.sizes(t, y, (_of_entries(y), 1 + largest))
     return Unsolved(ode.violations(t, y), root * own, on_the_way, ode.invariant_names)
 
 
-def _on_the_way(y: Flat, start: Flat, rates: Flat, span: Time) -> Flat:
+def _on_the_way(y: Flat, start: Flat, ydot: Flat, span: Time) -> Flat:
     """How large each variable has been on the way from `start`, as far as its ends show; over a second, where that is long."""
-    return jnp.maximum(jnp.maximum(jnp.abs(y), jnp.abs(start)), jnp.minimum(span, 1) * jnp.abs(rates))
+    return jnp.maximum(jnp.maximum(jnp.abs(y), jnp.abs(start)), jnp.minimum(span, 1) * jnp.abs(ydot))
 
 
 @at_ease

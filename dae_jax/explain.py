@@ -1,6 +1,7 @@
 """What a solve will do, in words: what was found in the system, what is therefore left out, and how it is compiled."""
 
 import dataclasses
+import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -18,7 +19,7 @@ from .driver.program import Solve
 from .driver.resets import Reset
 from .equations.linearised import LinearisedResidual
 from .equations.mechanical import MechanicalODE
-from .equations.sparse_normals import SparseNormals
+from .equations.sparse_constraint_jacobian import SparseConstraintJacobian
 from .formulations import AbstractFormulation
 from .linalg import SparseDefinite
 from .linalg.semidefinite import LOOPED, UNROLLED
@@ -46,7 +47,7 @@ class Plan:
     - `one_kernel`: whether the whole loop is compiled to one kernel; with a `Reset` the loop from one to the next.
     - `compiler`: who compiles it: "llvm", our compiler, as one kernel; "xla kernel", XLA as one kernel; "xla", XLA as many.
       `batch_compiler`: the same of a batch of starts under `vmap`; "xla" where XLA does it, in whatever form.
-    - `reasons`: what our compiler does not take, with the equation; `hindrances`: the primitives of these equations.
+    - `reasons`: what our compiler does not take, with the equation; `unsupported`: the primitives of these equations.
     - `left_out`: what other systems need and this one does not.
     """
 
@@ -57,12 +58,18 @@ class Plan:
     compiler: str
     batch_compiler: str
     reasons: tuple[str, ...]
-    hindrances: tuple[str, ...]
+    unsupported: tuple[str, ...]
     left_out: tuple[str, ...]
 
     @property
     def one_kernel(self) -> bool:
         return self.compiler != "xla"
+
+    @property
+    def hindrances(self) -> tuple[str, ...]:
+        """The former name of `unsupported`."""
+        warnings.warn("`hindrances` of a plan is called `unsupported` now.", DeprecationWarning, stacklevel=2)
+        return self.unsupported
 
     def __str__(self) -> str:
         return "\n".join(f"{name:>20}  {text}" for name, text in self._rows().items())
@@ -251,7 +258,7 @@ def explain(
     ode = ode if chart is None else ode.mechanical
     given = MechanicalODE.of(system, t0, y0, args, problem.rank)
     count = given.holonomic + given.nonholonomic
-    sparse = ode.linear if isinstance(ode.linear, SparseNormals) else None
+    sparse = ode.linear if isinstance(ode.linear, SparseConstraintJacobian) else None
     eliminated = _linear_solver(ode) if chart is None else f"none, {_elimination(counted(chart, 'coordinate'), chart)}"
     return MechanicalPlan(
         method=method,
@@ -275,7 +282,7 @@ def _compiled(solve: Solve, jaxpr: ClosedJaxpr, starts: list[bool]) -> dict[str,
     """Who compiles a solve's loop, and why; `starts`: which of its arguments a batch of starts has lanes of."""
     off = "off: derivatives through the loop, a progress meter, a switch, or neither a CPU nor a GPU"
     if not one_kernel_enabled() or solve.derivative() == "any":
-        return {"compiler": "xla", "batch_compiler": "xla", "reasons": (off,), "hindrances": ()}
+        return {"compiler": "xla", "batch_compiler": "xla", "reasons": (off,), "unsupported": ()}
     alone, batch = decision(jaxpr), decision(jaxpr, starts) if any(starts) else Decision("xla", ())
     reasons: dict[str, str] = {}
     for found in (*alone.unsupported, *batch.unsupported):
@@ -284,7 +291,7 @@ def _compiled(solve: Solve, jaxpr: ClosedJaxpr, starts: list[bool]) -> dict[str,
         "compiler": alone.compiler,
         "batch_compiler": "llvm" if batch.compiler == "llvm" else "xla",
         "reasons": tuple(reasons.values()),
-        "hindrances": tuple(dict.fromkeys(found.primitive for found in alone.unsupported)),
+        "unsupported": tuple(dict.fromkeys(found.primitive for found in alone.unsupported)),
     }
 
 
@@ -326,12 +333,13 @@ def _mass(system: ConstrainedSystem, mass: Float[Array, "..."] | None) -> str:
 
 def _linear_solver(ode: MechanicalODE) -> str:
     count = ode.holonomic + ode.nonholonomic
-    if isinstance(ode.linear, SparseNormals):
-        gram = ode.linear.gram
-        if isinstance(gram, SparseDefinite):
-            return f"sparse elimination along the diagonal, {counted(gram.symbolic.cost, 'multiplication')}"
-        return f"sparse elimination in {counted(len(gram.levels), 'level')}, {counted(gram.cost, 'multiplication')}" + (
-            f", then a dense system of {gram.rest_size}" if gram.rest_size > 1 else ""
+    if isinstance(ode.linear, SparseConstraintJacobian):
+        schur = ode.linear.schur
+        if isinstance(schur, SparseDefinite):
+            return f"sparse elimination along the diagonal, {counted(schur.symbolic.cost, 'multiplication')}"
+        return (
+            f"sparse elimination in {counted(len(schur.levels), 'level')}, {counted(schur.cost, 'multiplication')}"
+            + (f", then a dense system of {schur.rest_size}" if schur.rest_size > 1 else "")
         )
     some = "" if ode.rank is None else f"the {ode.rank[1]} that are independent of "
     return _elimination(some + counted(count, "constraint" if some else "unknown"), count)

@@ -21,7 +21,12 @@ from .jaxprs.walk import (
     is_large as is_large,
 )
 from .jit import Jitted as Jitted, compiles as compiles, jit as jit
-from .kernel_call import Decision as Decision, decision as decision, hindrances as hindrances
+from .kernel_call import (
+    Decision as Decision,
+    decision as decision,
+    hindrances as hindrances,
+    unsupported as unsupported,
+)
 from .linear_map import Moving as Moving
 from .one_kernel import (
     PullBack as PullBack,

@@ -1,6 +1,7 @@
 """What became of a function, to look at: jaxpr, annotated form, instructions, machine code, and what was in the way."""
 
 import dataclasses
+import warnings
 
 from jax.extend.core import ClosedJaxpr
 
@@ -29,7 +30,7 @@ class Lowered:
     - `compiler`: "llvm", one kernel by our compiler; "xla kernel", one by XLA; "xla", XLA as `jax.jit` has it.
     - `unsupported`: what our compiler does not take, each with `reason`, `equation` and `primitive`; empty if nothing.
     - `checks`: the messages of those that raise when the kernel is done.
-    - `lanes`: of a batch, which arguments have a leading axis.
+    - `batched`: of a batch, which arguments have a leading axis.
     """
 
     jaxpr: ClosedJaxpr
@@ -37,15 +38,21 @@ class Lowered:
     compiler: str
     unsupported: tuple[Unsupported, ...]
     checks: tuple[str, ...] = ()
-    lanes: tuple[bool, ...] = ()
+    batched: tuple[bool, ...] = ()
+
+    @property
+    def lanes(self) -> tuple[bool, ...]:
+        """The former name of `batched`."""
+        warnings.warn("`lanes` of what is lowered is called `batched` now.", DeprecationWarning, stacklevel=2)
+        return self.batched
 
     @classmethod
     def of(
-        cls, jaxpr: ClosedJaxpr, kernel: ClosedJaxpr, checks: tuple[str, ...] = (), lanes: tuple[bool, ...] = ()
+        cls, jaxpr: ClosedJaxpr, kernel: ClosedJaxpr, checks: tuple[str, ...] = (), batched: tuple[bool, ...] = ()
     ) -> "Lowered":
         """What becomes of `kernel`, which comes from `jaxpr`."""
-        found = decision(kernel, lanes)
-        return cls(jaxpr, kernel, found.compiler, found.unsupported, checks, lanes)
+        found = decision(kernel, batched)
+        return cls(jaxpr, kernel, found.compiler, found.unsupported, checks, batched)
 
     def batch(self) -> "Lowered":
         """The same for a batch of all arguments, as `jax.vmap` makes it."""
@@ -53,11 +60,11 @@ class Lowered:
 
     def annotated(self) -> str:
         """Each equation as our compiler takes it: uniform or varying over lanes, in registers or memory, and its cost."""
-        return str(lower.annotate(self.kernel, self.lanes))
+        return str(lower.annotate(self.kernel, self.batched))
 
     def ir(self) -> str:
         """LLVM's intermediate representation, before its passes. Errors: `Unsupported` where our compiler does not take it."""
-        return lower.written(self.kernel, self.lanes).replace("{name}", "kernel")
+        return lower.written(self.kernel, self.batched).replace("{name}", "kernel")
 
     def assembly(self) -> str:
         """The machine code in words. Errors: as `ir`."""
@@ -67,7 +74,7 @@ class Lowered:
 
     def __repr__(self) -> str:
         count = len(equations(self.kernel))
-        batch = ", a batch as lanes of vectors" if any(self.lanes) else ""
+        batch = ", a batch as lanes of vectors" if any(self.batched) else ""
         lines = [f"{_WORDS[self.compiler]}{batch}: {count} equations"]
         lines += [f"  not taken by our compiler: {reason}" for reason in self.unsupported]
         if self.checks:

@@ -44,33 +44,39 @@ class Decision:
     unsupported: tuple[Unsupported, ...]
 
 
-def decision(jaxpr: ClosedJaxpr, lanes: Sequence[bool] = ()) -> Decision:
-    """Who compiles a function on JAX's default device; `lanes`: of a batch, in which these arguments have a leading axis."""
+def decision(jaxpr: ClosedJaxpr, batched: Sequence[bool] = ()) -> Decision:
+    """Who compiles a function on JAX's default device; `batched`: of a batch, in which these arguments have a leading axis."""
     try:
         kernel, used = _needed(jaxpr)
     except Unsupported as reason:
         return Decision("xla", (reason,))
-    kept = tuple(b for b, u in zip(lanes, used, strict=True) if u) if lanes else ()
+    kept = tuple(b for b, u in zip(batched, used, strict=True) if u) if batched else ()
     return _decided(kernel, kept, jax.default_backend() == "gpu")
 
 
-def hindrances(jaxpr: ClosedJaxpr) -> tuple[str, ...]:
+def unsupported(jaxpr: ClosedJaxpr) -> tuple[str, ...]:
     """The names of the primitives in `jaxpr`, at any depth, that keep it from being one kernel; empty if none does."""
     found = decision(jaxpr)
     return tuple(dict.fromkeys(x.primitive for x in found.unsupported)) if found.compiler == "xla" else ()
 
 
-def _decided(kernel: ClosedJaxpr, lanes: tuple[bool, ...], on_gpu: bool = False) -> Decision:
+def hindrances(jaxpr: ClosedJaxpr) -> tuple[str, ...]:
+    """The former name of `unsupported`."""
+    warnings.warn("`compiler.hindrances` is called `compiler.unsupported` now.", DeprecationWarning, stacklevel=2)
+    return unsupported(jaxpr)
+
+
+def _decided(kernel: ClosedJaxpr, batched: tuple[bool, ...], on_gpu: bool = False) -> Decision:
     if current().compiler != "llvm":
         found = (Unsupported(f"our compiler is switched off: `compiler={current().compiler!r}`"),)
     elif on_gpu and gpu() is None:
         found = (Unsupported("there is no GPU that kernels work on", primitive="system"),)
     else:
-        found = lower.unsupported(kernel, lanes, gpu() if on_gpu else None)
+        found = lower.unsupported(kernel, batched, gpu() if on_gpu else None)
     if not found:
         return Decision("llvm", ())
     # XLA's single kernels are the CPU's; which form of a batch it takes depends on its size.
-    by_xla = not on_gpu and current().compiler != "off" and not xla_kernel.hindrances(kernel)
+    by_xla = not on_gpu and current().compiler != "off" and not xla_kernel.unsupported(kernel)
     return Decision("xla kernel" if by_xla else "xla", found)
 
 
@@ -130,8 +136,8 @@ def called(jaxpr: ClosedJaxpr, args: Sequence[Array], often: bool = True) -> lis
     ]
 
 
-def _bind(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Sequence[Array], often: bool) -> list[Any]:
-    return kernel_p.bind(*args, jaxpr=jaxpr, lanes=lanes, often=often)
+def _bind(jaxpr: ClosedJaxpr, batched: tuple[bool, ...], args: Sequence[Array], often: bool) -> list[Any]:
+    return kernel_p.bind(*args, jaxpr=jaxpr, batched=batched, often=often)
 
 
 @kernel_p.def_impl
@@ -143,41 +149,41 @@ def _(*args: Array, **params: Any) -> Any:
 
 
 @kernel_p.def_abstract_eval
-def _(*args: Array, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], **_: bool) -> Any:
-    lead = next(((x.shape[0],) for x, b in zip(args, lanes or [False] * len(args), strict=True) if b), ())
+def _(*args: Array, jaxpr: ClosedJaxpr, batched: tuple[bool, ...], **_: bool) -> Any:
+    lead = next(((x.shape[0],) for x, b in zip(args, batched or [False] * len(args), strict=True) if b), ())
     return [v.aval.update(shape=(*lead, *v.aval.shape)) for v in jaxpr.jaxpr.outvars]
 
 
 @at_ease
-def _lower(*args: Array, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], often: bool, on_gpu: bool) -> list[Any]:
+def _lower(*args: Array, jaxpr: ClosedJaxpr, batched: tuple[bool, ...], often: bool, on_gpu: bool) -> list[Any]:
     began = waiting.begin()
     try:
-        return _lowered(args, jaxpr, lanes, often, on_gpu)
+        return _lowered(args, jaxpr, batched, often, on_gpu)
     finally:
         if began:
             waiting.end()
 
 
 def _lowered(
-    args: Sequence[Array], jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], often: bool, on_gpu: bool
+    args: Sequence[Array], jaxpr: ClosedJaxpr, batched: tuple[bool, ...], often: bool, on_gpu: bool
 ) -> list[Any]:
-    ours = _by_llvm(jaxpr, lanes, args, often, on_gpu)
+    ours = _by_llvm(jaxpr, batched, args, often, on_gpu)
     if ours is None:
-        return kernel_written_out(*args, jaxpr=jaxpr, lanes=lanes) if on_gpu else _by_xla(jaxpr, lanes, args)
+        return kernel_written_out(*args, jaxpr=jaxpr, batched=batched) if on_gpu else _by_xla(jaxpr, batched, args)
     if current().check:
         return checked(
-            ours, jax.jit(lambda *xs: kernel_written_out(*xs, jaxpr=jaxpr, lanes=lanes))(*args), current().check
+            ours, jax.jit(lambda *xs: kernel_written_out(*xs, jaxpr=jaxpr, batched=batched))(*args), current().check
         )
     return ours
 
 
 def _by_llvm(
-    jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Sequence[Array], often: bool, on_gpu: bool
+    jaxpr: ClosedJaxpr, batched: tuple[bool, ...], args: Sequence[Array], often: bool, on_gpu: bool
 ) -> list[Any] | None:
-    if _decided(jaxpr, lanes, on_gpu).compiler != "llvm":
+    if _decided(jaxpr, batched, on_gpu).compiler != "llvm":
         return None
     try:
-        return lower.compiled(jaxpr, lanes, target=gpu() if on_gpu else None, often=often or bool(lanes))(*args)
+        return lower.compiled(jaxpr, batched, target=gpu() if on_gpu else None, often=often or bool(batched))(*args)
     except Unsupported as reason:
         fallbacks.note(str(reason))
     except Exception as error:  # XLA can still do it
@@ -186,23 +192,23 @@ def _by_llvm(
     return None
 
 
-def _by_xla(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Sequence[Array]) -> list[Any]:
-    if not lanes:
+def _by_xla(jaxpr: ClosedJaxpr, batched: tuple[bool, ...], args: Sequence[Array]) -> list[Any]:
+    if not batched:
         return xla_kernel.compiled(jaxpr)(*args)
-    axes = [0 if b else None for b in lanes]
+    axes = [0 if b else None for b in batched]
     in_step = jax.make_jaxpr(jax.vmap(jaxpr_as_fun(jaxpr), in_axes=axes))(*args)
     if xla_kernel.qualifies(in_step, batched=True) or not xla_kernel.qualifies(jaxpr):
         return xla_kernel.compiled(in_step, batched=True)(*args)
     # One lane after another in one kernel: none waits for another.
-    return xla_kernel.compiled(jax.make_jaxpr(lambda *xs: _in_turn(jaxpr, lanes, xs))(*args))(*args)
+    return xla_kernel.compiled(jax.make_jaxpr(lambda *xs: _in_turn(jaxpr, batched, xs))(*args))(*args)
 
 
-def _in_turn(jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], args: Sequence[Array]) -> list[Any]:
+def _in_turn(jaxpr: ClosedJaxpr, batched: tuple[bool, ...], args: Sequence[Array]) -> list[Any]:
     def one_lane(lane: Sequence[Array]) -> list[Any]:
         of_lane = iter(lane)
-        return jaxpr_as_fun(jaxpr)(*(next(of_lane) if b else x for x, b in zip(args, lanes, strict=True)))
+        return jaxpr_as_fun(jaxpr)(*(next(of_lane) if b else x for x, b in zip(args, batched, strict=True)))
 
-    return jax.lax.map(one_lane, tuple(x for x, b in zip(args, lanes, strict=True) if b))
+    return jax.lax.map(one_lane, tuple(x for x, b in zip(args, batched, strict=True) if b))
 
 
 for _platform in ("cpu", "cuda"):
@@ -213,22 +219,22 @@ mlir.register_lowering(kernel_p, mlir.lower_fun(kernel_written_out, multiple_res
 
 @at_ease
 def _batch(
-    args: Sequence[Array], dims: Sequence[int | None], *, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], often: bool
+    args: Sequence[Array], dims: Sequence[int | None], *, jaxpr: ClosedJaxpr, batched: tuple[bool, ...], often: bool
 ) -> tuple[list[Any], list[Any]]:
-    batched = [d is not None for d in dims]
+    mapped = [d is not None for d in dims]
     args = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(args, dims, strict=True)]
-    size = next(x.shape[0] for x, b in zip(args, batched, strict=True) if b)
+    size = next(x.shape[0] for x, b in zip(args, mapped, strict=True) if b)
     # `jacfwd` asks that a value which does not depend on the direction stays unbatched.
-    differs = lower.varying(jaxpr, batched, in_memory=False)
+    differs = lower.varying(jaxpr, mapped, in_memory=False)
     if size == 1:  # the one direction of a derivative by a number
-        out = _bind(jaxpr, lanes, [x[0] if b else x for x, b in zip(args, batched, strict=True)], often)
+        out = _bind(jaxpr, batched, [x[0] if b else x for x, b in zip(args, mapped, strict=True)], often)
         out = [o[None] for o in out]
-    elif not lanes:
-        out = _bind(jaxpr, tuple(batched), args, often)
+    elif not batched:
+        out = _bind(jaxpr, tuple(mapped), args, often)
     else:
-        inner = next(x.shape[b] for x, b, of in zip(args, batched, lanes, strict=True) if of)
-        joined = tuple(map(max, batched, lanes))
-        flat = [_joined(x, size, inner, b, of) for x, b, of in zip(args, batched, lanes, strict=True)]
+        inner = next(x.shape[b] for x, b, of in zip(args, mapped, batched, strict=True) if of)
+        joined = tuple(map(max, mapped, batched))
+        flat = [_joined(x, size, inner, b, of) for x, b, of in zip(args, mapped, batched, strict=True)]
         out = [o.reshape(size, inner, *o.shape[1:]) for o in _bind(jaxpr, joined, flat, often)]
     return [o if d else o[0] for o, d in zip(out, differs, strict=True)], [0 if d else None for d in differs]
 

@@ -63,7 +63,7 @@ def _test(to: Target, device: Any) -> None:
     for dtype in (np.float32, np.float64) if setting("jax_enable_x64") else (np.float32,):
         x = rng.normal(size=(1000, 2)).astype(dtype)
         jaxpr = jax.make_jaxpr(_solve)(turns[0], x[0])
-        by_xla = functools.partial(kernel_written_out, jaxpr=jaxpr, lanes=(True, True))
+        by_xla = functools.partial(kernel_written_out, jaxpr=jaxpr, batched=(True, True))
         with jax.default_device(device), jax.ensure_compile_time_eval():
             ours, theirs = (jax.jit(f)(turns, x) for f in (lower.compiled(jaxpr, (True, True), target=to), by_xla))
         for k, (a, b) in enumerate(zip(ours, theirs, strict=True)):

@@ -37,7 +37,7 @@ def one_kernel(
 ) -> Callable[..., Any]:
     """`fn` (pytrees of arrays to a pytree of arrays), compiled to one kernel on the CPU or a GPU where it qualifies.
 
-    On another backend, or where `hindrances` finds a reason, it is `fn` itself. Under `vmap` the batched function is
+    On another backend, or where `unsupported` finds a reason, it is `fn` itself. Under `vmap` the batched function is
     looked at afresh. `derivative` says in which mode `fn` can be differentiated: its derivative is again one kernel
     where it qualifies; with "any" it is the plain `fn` throughout.
 

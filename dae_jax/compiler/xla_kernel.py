@@ -31,13 +31,13 @@ SMALL_DOT = 64
 LARGE_REDUCTION = 4096
 
 
-def hindrances(jaxpr: ClosedJaxpr | Jaxpr) -> tuple[str, ...]:
+def unsupported(jaxpr: ClosedJaxpr | Jaxpr) -> tuple[str, ...]:
     """The names of the primitives in `jaxpr`, at any depth, that keep it from being one kernel; empty if none does."""
-    found = [eqn.primitive.name if _hinders(eqn) else "" for eqn in equations(jaxpr)]
+    found = [eqn.primitive.name if _is_unsupported(eqn) else "" for eqn in equations(jaxpr)]
     return tuple(dict.fromkeys([name for name in found if name] or ["size"] * (len(found) > LIMIT)))
 
 
-def _hinders(eqn: Equation) -> bool:
+def _is_unsupported(eqn: Equation) -> bool:
     name = eqn.primitive.name
     if eqn.effects:
         return True
@@ -58,7 +58,7 @@ def _hinders(eqn: Equation) -> bool:
 def qualifies(jaxpr: ClosedJaxpr, batched: bool = False) -> bool:
     """Whether XLA can make one kernel of it."""
     # Of the scatters only the update of one row becomes a copy, and that for certain only where nothing is batched.
-    return not hindrances(jaxpr) and not (
+    return not unsupported(jaxpr) and not (
         batched and any(eqn.primitive.name.startswith("scatter") for eqn in equations(jaxpr))
     )
 

@@ -40,7 +40,7 @@ from .summed_errors import SummedErrors
 from .switches import stepped_over
 from .tolerances import in_integrated, in_one_vector, measured
 from .traced_once import TracedOnce
-from .trajectory_adjoint import as_it_is, can_be_taped
+from .trajectory_adjoint import as_it_is, has_trajectory_adjoint
 
 
 if TYPE_CHECKING:
@@ -216,12 +216,12 @@ def _for_loops(
     t0: Time,
     t1: Time,
 ) -> Any:
-    """The solver as diffrax's loops and its reverse derivative need it; the tape knows accepted steps only."""
+    """The solver as diffrax's loops and its reverse derivative need it; the trajectory has accepted steps only."""
     size = sum(leaf.size for leaf in jax.tree.leaves(y))
     ours = (isinstance(solver, AbstractManifoldSolver) or takes_residuals(solver)) and not hasattr(
         solver, "root_finder"
     )
-    by_diffrax = solve.derivative() == "reverse" and not can_be_taped(solve, size)
+    by_diffrax = solve.derivative() == "reverse" and not has_trajectory_adjoint(solve, size)
     solver = WithoutFailedSteps(solver) if ours and by_diffrax else solver
     return TracedOnce(OneCrossing.of(solver, conditions, flags, solve.formulation, t0, t1) if conditions else solver)
 

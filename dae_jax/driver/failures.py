@@ -99,7 +99,7 @@ def not_finite_beyond(sol: DAESolution, problem: Problem) -> str:
     else:
         form = ResidualForm.of(system, t, y, args)
         flat_y = form.encode(y)
-        slope = ravel_pytree(form.decode(t, LinearisedResidual.of(form, flat_y).rates(t, flat_y)))[0]
+        slope = ravel_pytree(form.decode(t, LinearisedResidual.of(form, flat_y).ydot(t, flat_y)))[0]
     slope = jnp.where(jnp.isfinite(slope), slope, 0)
     for part in BEYOND:
         ahead = part * (t1 - t0)

@@ -81,10 +81,10 @@ class Undetermined(eqx.Module):
             blocks, slope = _underlying(args).oriented, None
         return Seen(jnp.asarray(False), jnp.asarray(True), (jnp.full((2, len(blocks)), jnp.nan, dtype), slope))
 
-    def _look(self, equations: Any, t: Time, y: Y, rates: Any) -> tuple[BoolLike, Any]:
+    def _look(self, equations: Any, t: Time, y: Y, ydot: Any) -> tuple[BoolLike, Any]:
         """Whether all is determined at a point, and what of the determinants is compared."""
         if self.leading is not None:
-            return True, self.leading.determinants(equations.form, t, y, rates)
+            return True, self.leading.determinants(equations.form, t, y, ydot)
         ode = _underlying(equations)
         determined, found = ode.determines_highest(t, y[: ode.orders.size])
         # A method for residuals looks at the matrix of its own unknowns.
@@ -93,7 +93,7 @@ class Undetermined(eqx.Module):
     def __call__(self, step: Step, before: Seen) -> Seen:
         t0, t1 = step.direction * step.t0, step.direction * step.t1
         marked, slope = before.mark
-        rates = (0, 0) if slope is None else slope.at_ends(t1 - t0, step.y1 - step.y0)
+        ydot = (0, 0) if slope is None else slope.at_ends(t1 - t0, step.y1 - step.y0)
 
         def goes_on(carry: Any) -> BoolScalar:
             k, _, (start, end, _) = carry
@@ -103,7 +103,7 @@ class Undetermined(eqx.Module):
         def look(carry: Any) -> Any:
             k, _, found = carry
             at = lambda a, b: jnp.where(k == 0, a, jnp.where(k == 1, b, (a + b) / 2))
-            point = at(t0, t1), jax.tree.map(at, step.y0, step.y1), at(*rates)
+            point = at(t0, t1), jax.tree.map(at, step.y0, step.y1), at(*ydot)
             determined, here = self._look(step.args, *point)
             return (
                 k + 1,
@@ -126,12 +126,12 @@ class Undetermined(eqx.Module):
 class _Slope(NamedTuple):
     """That of the last step, and its size; before the first one ẏ, and 0."""
 
-    rates: Any
+    ydot: Any
     size: Any
 
     def at_ends(self, h: Any, change: Any) -> Any:
         """ẏ at the ends of the next step, of that size, by the parabola of both."""
-        bend = (change / h - self.rates) * (h / (h + self.size))
+        bend = (change / h - self.ydot) * (h / (h + self.size))
         return change / h - bend, change / h + bend
 
     def after(self, h: Any, change: Any) -> "_Slope":

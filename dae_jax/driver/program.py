@@ -40,7 +40,7 @@ from .resets import Reset, solve_with_resets
 from .start import saved_parts
 from .switches import warn_of_moving_switches
 from .tolerances import span_of
-from .trajectory_adjoint import Taped, as_it_is, can_be_taped, cotangents, recorded, saved_times
+from .trajectory_adjoint import StepInputs, as_it_is, cotangents, has_trajectory_adjoint, recorded, saved_times
 
 
 FORWARD_ONLY = (
@@ -135,7 +135,7 @@ class Solve:
     max_steps: int | None
     # Whether a derivative that is not known is an error.
     throw: bool = False
-    # Whether the dense output is there for the tape alone.
+    # Whether the dense output is there for the trajectory alone.
     recording: bool = False
     # Whether steps are to be good between their ends though nothing is saved there.
     counts_between: bool = False
@@ -217,12 +217,12 @@ class Solve:
         return numbers, arrays
 
     def _pull_back(self, problem: Problem) -> PullBack | None:
-        """The reverse derivative from a tape, where it applies."""
+        """The reverse derivative from the trajectory, where it applies."""
         if self.derivative() == "forward":
             return _refuse_reverse
         size = sum(leaf.size for leaf in jax.tree.leaves(problem.y0))
         fixed_steps = isinstance(self.controller, diffrax.ConstantStepSize)
-        if self.derivative() != "reverse" or not can_be_taped(self, size):
+        if self.derivative() != "reverse" or not has_trajectory_adjoint(self, size):
             return None
         program, _ = split((self, problem))
 
@@ -242,15 +242,15 @@ class Solve:
 
                 def encoded(numbers: PyTree) -> Any:
                     solve, problem = program.whole(eqx.combine(numbers, others))
-                    found, fixed[:] = solve._taped(problem).moving_apart(others)
+                    found, fixed[:] = solve._step_inputs(problem).moving_apart(others)
                     return found
 
                 found, through_encoding = jax.vjp(encoded, numbers)
                 of_t0, of_t1, of_ts, of_ys, _, of_stats, *_ = cotangent.numbers
                 of_t1 = of_t1 + of_stats["end_time"]
-                tape = ts, ys, None if interpolation is None else interpolation.path.infos
-                of_taped = cotangents(found, Taped(*fixed), fixed_steps, tape, of_ys)
-                (of_arrays,) = through_encoding(saved_times(of_taped, self.saveat.subs, of_t0, of_t1, of_ts))
+                trajectory = ts, ys, None if interpolation is None else interpolation.path.infos
+                of_inputs = cotangents(found, StepInputs(*fixed), fixed_steps, trajectory, of_ys)
+                (of_arrays,) = through_encoding(saved_times(of_inputs, self.saveat.subs, of_t0, of_t1, of_ts))
                 return inexact(if_reached(of_arrays, of_bits(*steps) if steps else None, took_steps(again)))
 
         return pull_back
@@ -292,7 +292,7 @@ class Solve:
 
         return way
 
-    def _taped(self, problem: Problem) -> Taped:
+    def _step_inputs(self, problem: Problem) -> StepInputs:
         y, ode = self.encoded(problem)
         part = self.saveat.subs
         solver, flow, still = economical(self.solver, self.between()), self.flow(), self.is_still(y)
@@ -300,7 +300,7 @@ class Solve:
         start = jnp.where(problem.t0 == problem.t1, jax.lax.stop_gradient(problem.t0), problem.t0)
         y = held(y, start, flow, ode) if still else y
         view = View(part.fn, Decode(flow, self.solver, still), problem.args)
-        return Taped(self.formulation, solver, part, problem.t0, problem.t1, problem.dt0, y, ode, view)
+        return StepInputs(self.formulation, solver, part, problem.t0, problem.t1, problem.dt0, y, ode, view)
 
     def flow(self) -> Flow:
         """Where points move with their time: the time of an event is that where a condition is zero, whose derivative by others, at that

@@ -1,10 +1,10 @@
-"""The reverse derivative of a solve from a tape of its accepted steps.
+"""The reverse derivative of a solve from the trajectory of its accepted steps.
 
 The derivative is that of the discrete solution (discretise-then-optimise), as with `diffrax.RecursiveCheckpointAdjoint`;
 the sizes of the steps are constants, but for the last, which ends at t1, and for fixed ones. Forwards, the point of every
 accepted step is written down; backwards, each step is done once more together with its derivative. Both are loops of plain
-arithmetic, which compile to a kernel each; diffrax's checkpoints need library calls. It is used where the tape is small, and
-for solvers whose step is a function of its start, or that can `replay` it: of implicit ones the tape has the stages, and a
+arithmetic, which compile to a kernel each; diffrax's checkpoints need library calls. It is used where the trajectory is small, and
+for solvers whose step is a function of its start, or that can `replay` it: of implicit ones the trajectory has the stages, and a
 step costs its derivative alone.
 """
 
@@ -28,15 +28,15 @@ if TYPE_CHECKING:
     from .program import Solve
 
 
-# Numbers on the tape, at most, of points, and of a large system, whose steps take longer than to lay out the tape, in all; beyond
+# Numbers of a trajectory, at most, of points, and of a large system, whose steps take longer than to lay out the trajectory, in all; beyond
 # that diffrax's checkpoints, which take twice the time and more.
-LARGEST_TAPE, LARGEST_OF_LARGE = 2**20, 2**25
+LARGEST_TRAJECTORY, LARGEST_OF_LARGE = 2**20, 2**25
 
 
-def can_be_taped(solve: "Solve", size: int) -> bool:
-    """Whether the tape serves a solve with `size` unknowns."""
+def has_trajectory_adjoint(solve: "Solve", size: int) -> bool:
+    """Whether it serves a solve with `size` unknowns."""
     saveat, part = solve.saveat, solve.saveat.subs
-    numbers, largest = (solve.max_steps or 0) + 1, LARGEST_TAPE
+    numbers, largest = (solve.max_steps or 0) + 1, LARGEST_TRAJECTORY
     if size > LARGE:
         numbers, largest = numbers * (1 + getattr(solve.solver, "kept", 0)), LARGEST_OF_LARGE
     return (
@@ -55,11 +55,11 @@ def recorded(stages: bool) -> diffrax.SaveAt:
     return diffrax.SaveAt(subs=diffrax.SubSaveAt(t0=True, steps=True, fn=as_it_is), dense=stages)
 
 
-# What the tape holds: the point in the integration's variables.
+# What a trajectory holds: the point in the integration's variables.
 as_it_is = lambda t, y, ode: y
 
 
-class Taped(NamedTuple):
+class StepInputs(NamedTuple):
     """What a solve depends on, once the state is encoded."""
 
     formulation: Any
@@ -72,44 +72,44 @@ class Taped(NamedTuple):
     ode: Any
     view: Any
 
-    def moving_apart(self, still: PyTree[Array]) -> tuple["Taped", "Taped"]:
+    def moving_apart(self, still: PyTree[Array]) -> tuple["StepInputs", "StepInputs"]:
         """What has cotangents and the rest, where these arrays are `still`: what is none of them, and in any case the state."""
         known = set(map(id, jax.tree.leaves(still)))
         moves = lambda x: eqx.is_inexact_array(x) and id(x) not in known
         flags = (
             jax.tree.map(eqx.is_inexact_array if name == "y" else moves, part) for name, part in self._asdict().items()
         )
-        return eqx.partition(self, Taped(*flags))
+        return eqx.partition(self, StepInputs(*flags))
 
 
 def cotangents(
-    numbers: Taped,
-    rest: Taped,
+    numbers: StepInputs,
+    rest: StepInputs,
     fixed_steps: bool,
-    tape: tuple[Float[Array, " steps"], Y, PyTree[Array]],
+    trajectory: tuple[Float[Array, " steps"], Y, PyTree[Array]],
     wanted: PyTree[Array],
-) -> Taped:
+) -> StepInputs:
     """The cotangents of what moves.
 
     **Arguments**
 
-    - `numbers`, `rest`: what `Taped.moving_apart` gives.
+    - `numbers`, `rest`: what `StepInputs.moving_apart` gives.
     - `fixed_steps`: whether the first step is dt0 and the others end where they divide the interval evenly; otherwise all have
       sizes of their own but the last.
-    - `tape`: times and points of the accepted steps, the start first, and for a solver that replays them what is between;
+    - `trajectory`: times and points of the accepted steps, the start first, and for a solver that replays them what is between;
       times that are not finite are padding.
     - `wanted`: the cotangents of the saved values, a leading axis of times.
     """
-    times, points, between = tape
-    taped = eqx.combine(numbers, rest)
-    part = taped.part
+    times, points, between = trajectory
+    inputs = eqx.combine(numbers, rest)
+    part = inputs.part
     save_times = jnp.zeros(0, times.dtype) if part.ts is None else part.ts
     first = int(part.t0)
-    direction = jnp.where(taped.t1 < taped.t0, -1, 1)
+    direction = jnp.where(inputs.t1 < inputs.t0, -1, 1)
     last = jnp.sum(jnp.isfinite(times)) - 1
     last_saved, end = _last_needed(direction, times, save_times, wanted, first)
     end = jnp.minimum(end, last - 1)
-    still = taped.view.decode.still
+    still = inputs.view.decode.still
     times_move = jax.tree.leaves((numbers.t0, numbers.t1, numbers.dt0, numbers.part.ts))
     of_ends = (lambda times: times) if times_move and not still else lax.stop_gradient
     # What is saved moves with its time as the equations say, but where no step is taken; and not at all where nothing is asked for that.
@@ -145,9 +145,9 @@ def cotangents(
 
     def shared(k: IntScalar, cotangent: Scalar) -> tuple[Any, Any, Any]:
         """The cotangent of the k-th time as those of t0, t1 and dt0: how diffrax's controllers make it from them."""
-        evenly = jnp.where(k == 1, 0.0, (times[k] - taped.t0) / (taped.t1 - taped.t0)) if fixed_steps else 0.0
-        fraction = jnp.where(times[k] == taped.t1, 1.0, evenly)
-        first = jnp.where((k == 1) & (times[k] != taped.t1), 1.0, 0.0) if fixed_steps else 0.0
+        evenly = jnp.where(k == 1, 0.0, (times[k] - inputs.t0) / (inputs.t1 - inputs.t0)) if fixed_steps else 0.0
+        fraction = jnp.where(times[k] == inputs.t1, 1.0, evenly)
+        first = jnp.where((k == 1) & (times[k] != inputs.t1), 1.0, 0.0) if fixed_steps else 0.0
         return (1 - fraction) * cotangent, fraction * cotangent, first * cotangent
 
     def saves_in_step(k: IntScalar, moving: PyTree, fixed: PyTree, carry: tuple[PyTree, ...]) -> Any:
@@ -181,7 +181,7 @@ def cotangents(
         k, j, of_y, of_history, of_numbers, of_t0, of_t1, of_times = carry
         history = begin
         if jax.tree.leaves(begin):
-            before = taped.solver.history_after(_entry(between, jnp.maximum(k - 1, 0)))
+            before = inputs.solver.history_after(_entry(between, jnp.maximum(k - 1, 0)))
             history = jax.tree.map(lambda x, y: jnp.where(k == 0, x, y), begin, before)
         known = _entry(between, k)
         (_, _, moving), pull_back, fixed = jax.vjp(
@@ -204,10 +204,10 @@ def cotangents(
         of_numbers = of_numbers._replace(dt0=_plus(of_numbers.dt0, a2 + b2))
         return k - 1, j, of_y, of_history, of_numbers, of_t0 + a0 + b0, of_t1 + a1 + b1, of_times
 
-    of_y, of_numbers, zero = _zeros(_entry(points, 0)), _zeros(numbers), jnp.zeros_like(taped.t0)
+    of_y, of_numbers, zero = _zeros(_entry(points, 0)), _zeros(numbers), jnp.zeros_like(inputs.t0)
     of_t1 = zero
     if part.t1:
-        _, pull_back = jax.vjp(saved, numbers, taped.t1, _entry(points, last))
+        _, pull_back = jax.vjp(saved, numbers, inputs.t1, _entry(points, last))
         of_numbers, of_t1, of_y = pull_back(_entry(wanted, -1))
         end = jnp.where(_is_zero(_entry(wanted, -1)), end, last - 1)
     carry = (end, last_saved, of_y, _zeros(begin), of_numbers, zero, of_t1, jnp.zeros_like(save_times))
@@ -216,7 +216,7 @@ def cotangents(
     )
     of_numbers = _sum(of_numbers, begins(of_begin)[0])
     if first or save_times.size:
-        _, pull_back = jax.vjp(saved, numbers, taped.t0, taped.y)
+        _, pull_back = jax.vjp(saved, numbers, inputs.t0, inputs.y)
         more_numbers, more_t0, more_y = pull_back(_of_start(wanted, first, jnp.where(last > 0, 0, save_times.size)))
         of_numbers, of_t0, of_y = _sum(of_numbers, more_numbers), of_t0 + more_t0, _sum(of_y, more_y)
     of_numbers = of_numbers._replace(y=_sum(of_numbers.y, of_y))
@@ -224,20 +224,20 @@ def cotangents(
 
 
 def saved_times(
-    of_taped: Taped, part: diffrax.SubSaveAt, of_t0: Scalar, of_t1: Scalar, of_ts: Float[Array, " times"]
-) -> Taped:
+    of_inputs: StepInputs, part: diffrax.SubSaveAt, of_t0: Scalar, of_t1: Scalar, of_ts: Float[Array, " times"]
+) -> StepInputs:
     """`cotangents` with those of the times that a solution holds: its t0, t1, and the ts that `part` asks for."""
     first = int(part.t0)
     of_times = None if part.ts is None else of_ts[first : first + part.ts.size]
-    return _with_times(of_taped, of_t0 + (of_ts[0] if part.t0 else 0), of_t1 + (of_ts[-1] if part.t1 else 0), of_times)
+    return _with_times(of_inputs, of_t0 + (of_ts[0] if part.t0 else 0), of_t1 + (of_ts[-1] if part.t1 else 0), of_times)
 
 
-def _with_times(of_taped: Taped, of_t0: Scalar, of_t1: Scalar, of_times: Array | None) -> Taped:
-    """`of_taped` and what else its times have."""
-    found = of_taped._replace(t0=_plus(of_taped.t0, of_t0), t1=_plus(of_taped.t1, of_t1))
-    if of_taped.part.ts is None:
+def _with_times(of_inputs: StepInputs, of_t0: Scalar, of_t1: Scalar, of_times: Array | None) -> StepInputs:
+    """`of_inputs` and what else its times have."""
+    found = of_inputs._replace(t0=_plus(of_inputs.t0, of_t0), t1=_plus(of_inputs.t1, of_t1))
+    if of_inputs.part.ts is None:
         return found
-    return eqx.tree_at(lambda found: found.part.ts, found, of_taped.part.ts + of_times)
+    return eqx.tree_at(lambda found: found.part.ts, found, of_inputs.part.ts + of_times)
 
 
 def _plus(cotangent: Any, more: Any) -> Any:

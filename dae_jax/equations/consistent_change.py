@@ -43,7 +43,7 @@ def consistent_change(system: System, t: Time, y: State, change: State, args: Ar
     at = ode.encode(t, y)
     is_value = ode.orders.values >= 0
     aim = jnp.where(is_value, take(wanted, ode.orders.values), 0)
-    a = ode.normals(t, at)
+    a = ode.jacobian(t, at)
     of_form = lambda system, args: dataclasses.replace(ode, form=ResidualForm.of(system, t, y, args)).violations(t, at)
     found = aim + step_to(
         a,

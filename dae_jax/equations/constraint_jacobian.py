@@ -1,7 +1,8 @@
-"""The linear algebra of a mechanism's constraints at one point: A, M⁻¹Aᵀ and (A M⁻¹Aᵀ)⁻¹, dense here, sparse in `sparse_normals`.
+"""The linear algebra of a mechanism's constraints at one point: A, M⁻¹Aᵀ and (A M⁻¹Aᵀ)⁻¹, dense; `sparse_constraint_jacobian` has
+the sparse.
 
-Both classes are hashable descriptions without numbers. `at` linearises, and what it returns, the *normals*, is handed to
-the other methods; `ode` is the `MechanicalODE` that the constraints belong to.
+Both classes are hashable descriptions without numbers. `at` linearises, and what it returns, the Jacobian and what solves with
+the Schur complement A M⁻¹Aᵀ need, is handed to the other methods; `ode` is the `MechanicalODE` that the constraints belong to.
 """
 
 import dataclasses
@@ -17,7 +18,7 @@ from ..linalg import Factors, factorised, semidefinite_solve, solve_with
 from ..linalg.semidefinite import LOOPED, UNROLLED, by_lapack
 from ..structure import dependence
 from ..types import Flat, Time
-from .manifold_ode import Normals
+from .manifold_ode import ConstraintJacobian
 
 
 # Up to this many multiplications a product is written as a sum, which can become part of a kernel; a dot cannot.
@@ -37,7 +38,7 @@ class Mechanism(Protocol):
 
 
 @dataclasses.dataclass(frozen=True)
-class DenseNormals:
+class DenseConstraintJacobian:
     """A as a matrix; `rank` where some of its rows depend on others."""
 
     holonomic: int
@@ -45,68 +46,68 @@ class DenseNormals:
     rank: Rank | None
 
     def at(self, ode: Mechanism, t: Time, q: Flat, v: Flat) -> tuple[Array, ...]:
-        """A and M⁻¹Aᵀ, the normals in the metric of the mass matrix; and where solves with A M⁻¹Aᵀ are no straight-line code, or
+        """A and M⁻¹Aᵀ; and where solves with A M⁻¹Aᵀ are no straight-line code, or
         some constraints depend on others, that matrix, with a diagonal of 1, what made it so, and its factors.
         """
         a = ode.constraint_jacobian(t, q, v)
         n = mass_solve(ode.mass(q), a.T)
         if self.rank is None and not UNROLLED < len(a) <= LOOPED:
             return a, n
-        gram = _matmul(a, n)
-        scale = unit_diagonal(gram)
-        gram = gram * scale[:, None] * scale
+        schur = _matmul(a, n)
+        scale = unit_diagonal(schur)
+        schur = schur * scale[:, None] * scale
         counts = None if self.rank is None else ((self.holonomic, self.rank[0]), (len(a), self.rank[1]))
-        return a, n, gram, scale, *factorised(gram, counts)
+        return a, n, schur, scale, *factorised(schur, counts)
 
-    def along(self, ode: Mechanism, normals: Normals, x: Float[Array, " n"]) -> Float[Array, " c"]:
+    def along(self, ode: Mechanism, jacobian: ConstraintJacobian, x: Float[Array, " n"]) -> Float[Array, " c"]:
         """A x."""
-        return matvec(normals[0], x)
+        return matvec(jacobian[0], x)
 
-    def freed(self, ode: Mechanism, normals: Normals, q: Flat, force: Flat) -> Flat:
+    def freed(self, ode: Mechanism, jacobian: ConstraintJacobian, q: Flat, force: Flat) -> Flat:
         """M⁻¹ f."""
         return mass_solve(ode.mass(q), force)
 
-    def lift(self, ode: Mechanism, normals: Normals, mu: Float[Array, " c"]) -> Float[Array, " n"]:
+    def lift(self, ode: Mechanism, jacobian: ConstraintJacobian, mu: Float[Array, " c"]) -> Float[Array, " n"]:
         """M⁻¹Aᵀ μ, of the first constraints where μ is shorter."""
-        return matvec(normals[1][:, : mu.shape[0]], mu)
+        return matvec(jacobian[1][:, : mu.shape[0]], mu)
 
-    def gram_solve(self, ode: Mechanism, normals: Normals, b: Float[Array, " c"]) -> Float[Array, " c"]:
+    def schur_solve(self, ode: Mechanism, jacobian: ConstraintJacobian, b: Float[Array, " c"]) -> Float[Array, " c"]:
         """x with A M⁻¹Aᵀ x = b, of the first constraints where b is shorter; 0 where constraints depend on others."""
         c = b.shape[0]
-        a, n, *rest = normals
+        a, n, *rest = jacobian
         if not rest:
             return semidefinite_solve(_matmul(a[:c], n[:, :c]), b)
-        gram, scale, *factors = rest
+        schur, scale, *factors = rest
         # Pivots of the holonomic constraints come first.
         count = c if self.rank is None else self.rank[c > self.holonomic]
-        return scale[:c] * solve_with(Factors(*factors).first(count, c), gram[:c, :c], scale[:c] * b)
+        return scale[:c] * solve_with(Factors(*factors).first(count, c), schur[:c, :c], scale[:c] * b)
 
-    def least_norm(self, ode: Mechanism, normals: Normals, b: Float[Array, " c"]) -> Float[Array, " c"]:
+    def least_norm(self, ode: Mechanism, jacobian: ConstraintJacobian, b: Float[Array, " c"]) -> Float[Array, " c"]:
         """The shortest such x, of b that satisfies all constraints."""
         if self.rank is None:
-            return self.gram_solve(ode, normals, b)
+            return self.schur_solve(ode, jacobian, b)
         # Which constraints depend on each other has nothing to do with their scale.
-        gram, scale = normals[2:4]
-        count, columns = len(gram), jnp.concatenate([(scale * b)[:, None], gram], 1)
-        solved = semidefinite_solve(gram, columns, self.rank[1])
+        schur, scale = jacobian[2:4]
+        count, columns = len(schur), jnp.concatenate([(scale * b)[:, None], schur], 1)
+        solved = semidefinite_solve(schur, columns, self.rank[1])
         some, held = scale * solved[:, 0], solved[:, 1:]
         # How long an x is has. Of those that move nothing, as much is taken away as lies along them.
-        idle = scale[:, None] * (jnp.eye(count, dtype=gram.dtype) - held)
+        idle = scale[:, None] * (jnp.eye(count, dtype=schur.dtype) - held)
         along = semidefinite_solve(_matmul(idle.T, idle), matvec(idle.T, some), count - self.rank[1])
         return some - matvec(idle, along)
 
     @staticmethod
-    def independent(normals: Normals) -> Float[Array, " c"]:
+    def independent(jacobian: ConstraintJacobian) -> Float[Array, " c"]:
         """1 for each of as many constraints as are independent, where some depend on others."""
-        return Factors(*normals[4:]).kept()
+        return Factors(*jacobian[4:]).kept()
 
-    def lengths(self, ode: Mechanism, normals: Normals) -> Float[Array, " c"]:
+    def lengths(self, ode: Mechanism, jacobian: ConstraintJacobian) -> Float[Array, " c"]:
         """The length of each row of A."""
-        return jnp.sqrt(jnp.sum(normals[0] ** 2, 1))
+        return jnp.sqrt(jnp.sum(jacobian[0] ** 2, 1))
 
-    def reach(self, ode: Mechanism, normals: Normals, sizes: Float[Array, " n"]) -> Float[Array, " c"]:
+    def reach(self, ode: Mechanism, jacobian: ConstraintJacobian, sizes: Float[Array, " n"]) -> Float[Array, " c"]:
         """|A| s: what changes of that size may move each by."""
-        return matvec(jnp.abs(normals[0]), sizes)
+        return matvec(jnp.abs(jacobian[0]), sizes)
 
 
 def constraint_pattern(constraint: Callable[[Time, Flat], Array], t: Time, q: Flat) -> Bool[np.ndarray, "c n"] | None:

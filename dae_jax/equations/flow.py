@@ -40,7 +40,7 @@ def flow(
         unknown = jnp.full_like(y, jnp.nan)
         return y, form.decode, unknown, unknown
     h = jnp.asarray(h, y.dtype)
-    yd = linearised.rates(t, y)
+    yd = linearised.ydot(t, y)
     j, m = linearised.jacobians(t, y, yd)
     off = linearised.storage.apply(m, yd) - linearised.residual(t + h, y, yd)
     mean = linearised.solve(linearised.factor(j, m, 1 / h, h), off) / h

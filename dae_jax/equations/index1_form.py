@@ -77,7 +77,7 @@ class Index1Form(eqx.Module):
         """A tolerance for each unknown, of one for `each` number of the state."""
         return jnp.concatenate(self.ode.derivatives_tolerances(t, state, each, absolute))
 
-    def known_rates(self, z: Float[Array, " z"]) -> Float[Array, " z"]:
+    def known_ydot(self, z: Float[Array, " z"]) -> Float[Array, " z"]:
         """What z itself says of ż: the rate of all of Y."""
         return jnp.concatenate([take(z, self.ode.orders.derivatives), jnp.zeros(self.ode.form.size, z.dtype)])
 
@@ -105,9 +105,9 @@ class Index1Form(eqx.Module):
         highest = max(orders.equations)
         levels = self.ode.levels(t, y, x, highest + 1)
         last = self.ode.highest_of(levels)
-        rates = (zd - self.known_rates(z))[: orders.size]
+        ydot = (zd - self.known_ydot(z))[: orders.size]
         if not highest:
-            return jnp.concatenate([rates, last])
+            return jnp.concatenate([ydot, last])
         invariants = jnp.concatenate([take(levels[k], orders.rows(k)) for k in range(highest)])
         integrated = 1 - jnp.sum(self.directions, 0)
-        return jnp.concatenate([integrated * rates + jnp.sum(invariants[:, None] * self.directions, 0), last])
+        return jnp.concatenate([integrated * ydot + jnp.sum(invariants[:, None] * self.directions, 0), last])

@@ -37,7 +37,7 @@ def rates_of(form: ResidualForm, t: Time, y: Float[Array, " n"]) -> tuple[Float[
 
     Source: J. Nocedal, S. J. Wright, *Numerical Optimization*, 2nd ed., section 10.3.
     """
-    guess = form.known_rates(y)
+    guess = form.known_ydot(y)
     if form.rates_are_given:
         return _nearest(form, t, y, guess)[0], jnp.asarray(False)
     rng = np.random.default_rng(0)

@@ -180,7 +180,7 @@ class LinearisedResidual(eqx.Module):
         """Rows, or right-hand sides, in the combination in which highest derivatives do not cancel, with c for d/dt."""
         return _combined(self.structure.combination, rows, c)
 
-    def rates(self, t: Time, y: Float[Array, " n"]) -> Float[Array, " n"]:
+    def ydot(self, t: Time, y: Float[Array, " n"]) -> Float[Array, " n"]:
         """ẏ with F(t, y, ẏ) = 0 where y is consistent, else with the least F; for variables whose derivative does not occur
         what the form knows. Gauss–Newton's method, or a search where F is nonlinear in ẏ.
         """
@@ -195,7 +195,7 @@ class LinearisedResidual(eqx.Module):
             new = improved(yd)
             return new, relative_change(new - yd, yd)
 
-        start = self.form.known_rates(y)
+        start = self.form.known_ydot(y)
         if self.storage.dear:
             return fixed_point(correct, start, max_steps=DEAR_CORRECTIONS)[0]
         return jax.lax.fori_loop(0, GAUSS_NEWTON, lambda _, yd: improved(yd), start)
@@ -208,7 +208,7 @@ class LinearisedResidual(eqx.Module):
         """For a solve from (t, y)."""
         # Before they are computed, too: JAX would differentiate the search, and throw that away.
         fixed, t, y = constant((self, t, y))
-        return dataclasses.replace(self, start=constant(fixed.rates(t, y)))
+        return dataclasses.replace(self, start=constant(fixed.ydot(t, y)))
 
     def weights(self, h: Time, raised: Time = 1.0) -> Float[Array, " n"]:
         """(h/T)^(k−1) for a variable of index k > 1, where h is below its `time_scale` T: how much of its error counts; up to

@@ -21,7 +21,7 @@ from ..types import State, Time, TreeDef, Y
 
 _T = TypeVar("_T")
 # The constraints' linearisation at a point, in the form that its equations keep it in.
-Normals: TypeAlias = Array | tuple[Array, ...]
+ConstraintJacobian: TypeAlias = Array | tuple[Array, ...]
 # What is added to the highest derivative of a constraint, of the constraint and its lower derivatives.
 Feedback: TypeAlias = Callable[..., Array]
 
@@ -86,24 +86,24 @@ class ManifoldODE(eqx.Module):
         """H(t, y), level by level: the constraints, then their hidden derivatives."""
 
     @abc.abstractmethod
-    def normals(self, t: Time, y: Y) -> Any:
+    def jacobian(self, t: Time, y: Y) -> Any:
         """Directions that span a complement of the manifold's tangent space at (t, y), and what is needed to use them."""
 
-    def lasting_normals(self, t0: Time, y0: Y, t1: Time, ahead: Y) -> Any:
+    def lasting_jacobian(self, t0: Time, y0: Y, t1: Time, ahead: Y) -> Any:
         """Those at (t₀, y₀), or such as stay transversal to the manifold in a step to near (t₁, `ahead`)."""
-        return self.normals(t0, y0)
+        return self.jacobian(t0, y0)
 
     @abc.abstractmethod
-    def displace(self, y: Y, normals: Normals, mu: Float[Array, " c"]) -> Any:
-        """y + N μ, with the normals N and a flat vector μ."""
+    def displace(self, y: Y, jacobian: ConstraintJacobian, mu: Float[Array, " c"]) -> Any:
+        """y + N μ, with the directions N of `jacobian` and a flat vector μ."""
 
     @abc.abstractmethod
-    def retract_along(self, t: Time, y: Y, normals: Normals) -> tuple[Any, Bool[Array, ""]]:
+    def retract_along(self, t: Time, y: Y, jacobian: ConstraintJacobian) -> tuple[Any, Bool[Array, ""]]:
         """The point y + N μ on the manifold at time t, and whether it was found."""
 
     def project(self, t: Time, y: Y) -> tuple[Any, Bool[Array, ""]]:
-        """The nearest point on the manifold at time t, with the normals at y itself, and whether it was found."""
-        return self.retract_along(t, y, self.normals(t, y))
+        """The nearest point on the manifold at time t, with the Jacobian at y itself, and whether it was found."""
+        return self.retract_along(t, y, self.jacobian(t, y))
 
     def measured_in(self, t: Time, y: Y, lengths: Y) -> "ManifoldODE":
         """The same where points are near to each other by these lengths along each number of y, the tolerances of unknowns that have
@@ -112,8 +112,8 @@ class ManifoldODE(eqx.Module):
         return self
 
     @abc.abstractmethod
-    def tangent(self, dy: Y, normals: Normals) -> Any:
-        """The part of a derivative ẏ in the tangent space to which `normals` are normal."""
+    def tangent(self, dy: Y, jacobian: ConstraintJacobian) -> Any:
+        """The part of a derivative ẏ in the tangent space to which the rows of `jacobian` are normal."""
 
     @abc.abstractmethod
     def decode(self, t: Time, y: Y) -> Any:

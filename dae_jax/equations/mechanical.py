@@ -16,9 +16,9 @@ from ..linalg import fixed_point, implicit_root, relative_change, solve
 from ..structure.layout import Layout
 from ..systems import ConstrainedSystem
 from ..types import Args, DType, Flat, Phase, State, Time
-from .constraint_jacobian import DenseNormals, Rank, constraint_pattern, of_rows
-from .manifold_ode import Feedback, ManifoldODE, Normals, at_one_instant
-from .sparse_normals import SPARSE_FROM, SparseNormals, sparse_normals
+from .constraint_jacobian import DenseConstraintJacobian, Rank, constraint_pattern, of_rows
+from .manifold_ode import ConstraintJacobian, Feedback, ManifoldODE, at_one_instant
+from .sparse_constraint_jacobian import SPARSE_FROM, SparseConstraintJacobian, sparse_constraint_jacobian
 
 
 # From so many constraints on the forces of multipliers are found by reverse derivatives, at the price of the constraints. Of fewer by
@@ -45,7 +45,7 @@ class MechanicalODE(ManifoldODE):
     holonomic: int = eqx.field(static=True)
     nonholonomic: int = eqx.field(static=True)
     depends_on_time: tuple[bool, bool] = eqx.field(static=True)
-    linear: DenseNormals | SparseNormals = eqx.field(static=True)
+    linear: DenseConstraintJacobian | SparseConstraintJacobian = eqx.field(static=True)
 
     @classmethod
     def of(
@@ -61,20 +61,20 @@ class MechanicalODE(ManifoldODE):
         if isinstance(rank, int):
             rank = (rank if not h else max(rank - h, 0), rank)
         rank = None if rank == (g, g + h) else rank
-        ode = cls(system, args, layout, g, h, (g_uses_time, h_uses_time), DenseNormals(g, h, rank))
+        ode = cls(system, args, layout, g, h, (g_uses_time, h_uses_time), DenseConstraintJacobian(g, h, rank))
         sparse = ode._sparse(t, layout.flatten(q)) if h == 0 and g >= SPARSE_FROM and rank is None else None
         return ode if sparse is None else dataclasses.replace(ode, linear=sparse)
 
-    def _sparse(self, t: Time, q: Flat) -> SparseNormals | None:
+    def _sparse(self, t: Time, q: Flat) -> SparseConstraintJacobian | None:
         mass = jax.eval_shape(self.mass, q)
         pattern = constraint_pattern(self.constraint, t, q) if mass is None or mass.ndim != 2 else None
         block = mass.shape[1] if mass is not None and mass.ndim == 3 else 1
-        return None if pattern is None else sparse_normals(pattern, block)
+        return None if pattern is None else sparse_constraint_jacobian(pattern, block)
 
     @property
     def rank(self) -> Rank | None:
         """How many constraints are independent, where some are redundant: of the holonomic ones, and of all."""
-        return self.linear.rank if isinstance(self.linear, DenseNormals) else None
+        return self.linear.rank if isinstance(self.linear, DenseConstraintJacobian) else None
 
     def decode(self, t: Time, y: Phase) -> Any:
         q, v = y
@@ -180,31 +180,31 @@ class MechanicalODE(ManifoldODE):
     @at_one_instant
     def multipliers(self, t: Time, y: Phase) -> Float[Array, " mp"]:
         """(λ, μ), of least norm where constraints are redundant."""
-        normals, _, target = self._free(t, *y)
-        return self.linear.least_norm(self, normals, target)
+        jacobian, _, target = self._free(t, *y)
+        return self.linear.least_norm(self, jacobian, target)
 
-    def _free(self, t: Time, q: Flat, v: Flat) -> tuple[Normals, Float[Array, " n"], Float[Array, " mp"]]:
-        """The normals, M⁻¹f, and A M⁻¹f + γ, which is A M⁻¹Aᵀ(λ, μ)."""
-        normals = self.normals(t, (q, v))
-        free = self.linear.freed(self, normals, q, self.force(t, q, v))
-        return normals, free, self.linear.along(self, normals, free) + self.bias(t, q, v)
+    def _free(self, t: Time, q: Flat, v: Flat) -> tuple[ConstraintJacobian, Float[Array, " n"], Float[Array, " mp"]]:
+        """The Jacobian, M⁻¹f, and A M⁻¹f + γ, which is A M⁻¹Aᵀ(λ, μ)."""
+        jacobian = self.jacobian(t, (q, v))
+        free = self.linear.freed(self, jacobian, q, self.force(t, q, v))
+        return jacobian, free, self.linear.along(self, jacobian, free) + self.bias(t, q, v)
 
     def _accelerations(self, t: Time, q: Flat, v: Flat, feedback: Feedback | None) -> Float[Array, " n"]:
-        normals, free, target = self._free(t, q, v)
+        jacobian, free, target = self._free(t, q, v)
         if feedback is not None:
             target = target + self._feedback(t, q, v, feedback)
-        pulled = self.linear.lift(self, normals, self.linear.gram_solve(self, normals, target))
+        pulled = self.linear.lift(self, jacobian, self.linear.schur_solve(self, jacobian, target))
         if self.rank is not None:
-            pulled = self._unless_contradictory(t, (q, v), normals, target, pulled)
+            pulled = self._unless_contradictory(t, (q, v), jacobian, target, pulled)
         return free - pulled
 
     def _unless_contradictory(
-        self, t: Time, y: Phase, normals: Normals, target: Float[Array, " c"], pulled: Flat
+        self, t: Time, y: Phase, jacobian: ConstraintJacobian, target: Float[Array, " c"], pulled: Flat
     ) -> Any:
         """x = M⁻¹Aᵀλ, or NaN where it leaves more of A x = b than y is off the constraints: dependent ones disagree."""
-        lengths = self.linear.lengths(self, normals)
+        lengths = self.linear.lengths(self, jacobian)
         lengths = jnp.where(lengths > 0, lengths, 1)
-        off = jnp.max(jnp.abs(self.linear.along(self, normals, pulled) - target) / lengths)
+        off = jnp.max(jnp.abs(self.linear.along(self, jacobian, pulled) - target) / lengths)
         drift = jnp.max(jnp.concatenate(self.distances(t, y)))
         allowed = (allowed_contradiction(drift.dtype) + 10 * drift) * (1 + jnp.max(jnp.abs(target) / lengths))
         return jnp.where(off <= allowed, pulled, jnp.nan)
@@ -223,7 +223,7 @@ class MechanicalODE(ManifoldODE):
     @at_one_instant
     def distances(self, t: Time, y: Phase) -> tuple[Float[Array, " m"], Float[Array, " mp"]]:
         """The invariants divided by the length of each constraint's gradient: about how far y is from satisfying them."""
-        lengths = self.linear.lengths(self, self.normals(t, y))
+        lengths = self.linear.lengths(self, self.jacobian(t, y))
         lengths = jnp.where(lengths > 0, lengths, 1)
         g, velocity = self.invariants(t, y)
         return jnp.abs(g) / lengths[: self.holonomic], jnp.abs(velocity) / lengths
@@ -233,10 +233,10 @@ class MechanicalODE(ManifoldODE):
         """What counts as the size of the state for each constraint, in units of `distances`: Σ |Aᵢⱼ| sⱼ / |Aᵢ| for coordinates and
         speeds of the sizes `of`. A large one says nothing of a constraint in which it does not occur.
         """
-        normals = self.normals(t, y)
-        lengths = self.linear.lengths(self, normals)
+        jacobian = self.jacobian(t, y)
+        lengths = self.linear.lengths(self, jacobian)
         lengths = jnp.where(lengths > 0, lengths, 1)
-        positions, velocities = (self.linear.reach(self, normals, s) / lengths for s in of)
+        positions, velocities = (self.linear.reach(self, jacobian, s) / lengths for s in of)
         return positions[: self.holonomic], velocities
 
     @at_one_instant
@@ -245,41 +245,43 @@ class MechanicalODE(ManifoldODE):
         return self.constraint(t, q), self.velocity_constraint(t, q, v)
 
     @at_one_instant
-    def normals(self, t: Time, y: Phase) -> Any:
-        """The constraints' linearisation, as `normals.DenseNormals` and `normals.SparseNormals` have it."""
+    def jacobian(self, t: Time, y: Phase) -> Any:
+        """A, as `DenseConstraintJacobian` and `SparseConstraintJacobian` have it."""
         return self.linear.at(self, t, *y)
 
     @at_one_instant
-    def tangent(self, dy: Phase, normals: Normals) -> Any:
+    def tangent(self, dy: Phase, jacobian: ConstraintJacobian) -> Any:
         dq, dv = dy
-        return self._tangent(normals, dq, self.holonomic), self._tangent(normals, dv, None)
+        return self._tangent(jacobian, dq, self.holonomic), self._tangent(jacobian, dv, None)
 
-    def _tangent(self, normals: Normals, x: Float[Array, " n"], rows: int | None) -> Float[Array, " n"]:
-        off = self.linear.along(self, normals, x)[:rows]
-        return x - self.linear.lift(self, normals, self.linear.gram_solve(self, normals, off)) if off.size else x
+    def _tangent(self, jacobian: ConstraintJacobian, x: Float[Array, " n"], rows: int | None) -> Float[Array, " n"]:
+        off = self.linear.along(self, jacobian, x)[:rows]
+        return x - self.linear.lift(self, jacobian, self.linear.schur_solve(self, jacobian, off)) if off.size else x
 
-    def displace(self, y: Phase, normals: Normals, mu: Float[Array, " c"]) -> Any:
+    def displace(self, y: Phase, jacobian: ConstraintJacobian, mu: Float[Array, " c"]) -> Any:
         q, v = y
         m = self.holonomic
-        return q + self.linear.lift(self, normals, mu[:m]), v + self.linear.lift(self, normals, mu[m:])
+        return q + self.linear.lift(self, jacobian, mu[:m]), v + self.linear.lift(self, jacobian, mu[m:])
 
-    def retract_along(self, t: Time, y: Phase, normals: Normals) -> tuple[Any, Bool[Array, ""]]:
-        return self._restored(t, y, normals, self._corrected(t, y, normals, self.normals(t, y)))
+    def retract_along(self, t: Time, y: Phase, jacobian: ConstraintJacobian) -> tuple[Any, Bool[Array, ""]]:
+        return self._retracted(t, y, jacobian, self._corrected(t, y, jacobian, self.jacobian(t, y)))
 
     def project(self, t: Time, y: Phase) -> tuple[Any, Bool[Array, ""]]:
-        normals = self.normals(t, y)
-        return self._restored(t, y, normals, self._corrected(t, y, normals, normals))
+        jacobian = self.jacobian(t, y)
+        return self._retracted(t, y, jacobian, self._corrected(t, y, jacobian, jacobian))
 
-    def _restored(self, t: Time, y: Phase, normals: Normals, first: Sequence[Array]) -> tuple[Any, Bool[Array, ""]]:
+    def _retracted(
+        self, t: Time, y: Phase, jacobian: ConstraintJacobian, first: Sequence[Array]
+    ) -> tuple[Any, Bool[Array, ""]]:
         def iterate(params: PyTree) -> tuple[Float[Array, " c"], Bool[Array, ""]]:
             *point, first = params
             return fixed_point(lambda mu: MechanicalODE.correction(*point, mu), *first)
 
-        params = (self, t, y, normals, tuple(jax.lax.stop_gradient(first)))
+        params = (self, t, y, jacobian, tuple(jax.lax.stop_gradient(first)))
         mu, found = implicit_root(
             _manifold_residual, iterate, params, linear_solve=_on_rows, jacobian=_manifold_jacobian
         )
-        displaced = self.displace(y, normals, mu)
+        displaced = self.displace(y, jacobian, mu)
         return displaced, found if self.rank is None else found & self._all_hold(t, displaced)
 
     def _all_hold(self, t: Time, y: Phase) -> Bool[Array, ""]:
@@ -289,41 +291,45 @@ class MechanicalODE(ManifoldODE):
         return near[0] & near[1]
 
     @at_one_instant
-    def correction(self, t: Time, y: Phase, normals: Normals, mu: Float[Array, " c"]) -> tuple[Float[Array, " c"], Any]:
+    def correction(
+        self, t: Time, y: Phase, jacobian: ConstraintJacobian, mu: Float[Array, " c"]
+    ) -> tuple[Float[Array, " c"], Any]:
         """One Newton correction of μ in H(t, y + N μ) = 0, and its size: positions first, then the velocities at them.
 
         The matrix is A M⁻¹Aᵀ at the current point, which differs from the Jacobian A N by the square of the angle
         between the two normal spaces and stays symmetric.
         """
-        here = self.displace(y, normals, mu)
-        change, size = self._corrected(t, here, normals, self.normals(t, here))
+        here = self.displace(y, jacobian, mu)
+        change, size = self._corrected(t, here, jacobian, self.jacobian(t, here))
         return mu + change, size
 
     @at_one_instant
-    def _corrected(self, t: Time, y: Phase, normals: Normals, here: Normals) -> tuple[Float[Array, " c"], Any]:
-        """The correction of μ at a point y whose normals are `here`, and its size."""
+    def _corrected(
+        self, t: Time, y: Phase, jacobian: ConstraintJacobian, here: ConstraintJacobian
+    ) -> tuple[Float[Array, " c"], Any]:
+        """The correction of μ at a point y whose Jacobian is `here`, and its size."""
         q, v = y
         dq, delta = jnp.zeros_like(q), jnp.zeros(0, q.dtype)
         if self.holonomic:
-            delta = self.linear.gram_solve(self, here, self.constraint(t, q))
-            dq = self.linear.lift(self, normals, delta)
-        kappa = self.linear.gram_solve(self, here, self.velocity_constraint(t, q - dq, v))
-        sizes = relative_change(dq, q), relative_change(self.linear.lift(self, normals, kappa), v)
+            delta = self.linear.schur_solve(self, here, self.constraint(t, q))
+            dq = self.linear.lift(self, jacobian, delta)
+        kappa = self.linear.schur_solve(self, here, self.velocity_constraint(t, q - dq, v))
+        sizes = relative_change(dq, q), relative_change(self.linear.lift(self, jacobian, kappa), v)
         return -jnp.concatenate([delta, kappa]), jnp.maximum(*sizes)
 
 
 def _manifold_residual(mu: Float[Array, " c"], params: PyTree) -> Float[Array, " c"]:
-    ode, t, y, normals, _ = params
-    return jnp.concatenate(ode.invariants(t, ode.displace(y, normals, mu)))
+    ode, t, y, jacobian, _ = params
+    return jnp.concatenate(ode.invariants(t, ode.displace(y, jacobian, mu)))
 
 
 def _manifold_jacobian(mu: Float[Array, " c"], params: PyTree) -> tuple[Float[Array, "c c"], Float[Array, " c"] | None]:
     """That of `_manifold_residual`; where constraints depend on others, which of them are solved."""
-    ode, _, _, normals, _ = params
+    ode, _, _, jacobian, _ = params
     matrix = jax.jacfwd(_manifold_residual)(mu, params)
     if ode.rank is None:
         return matrix, None
-    kept = ode.linear.independent(normals)
+    kept = ode.linear.independent(jacobian)
     return matrix, jnp.concatenate([kept[: ode.holonomic], kept])
 
 

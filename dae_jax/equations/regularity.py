@@ -12,7 +12,7 @@ from ..linalg import factorised, minor_sign, row_products, semidefinite_solve, s
 from ..types import IntScalar, Phase, Time
 from .constraint_jacobian import Rank, mass_solve, matvec, unit_diagonal
 from .mechanical import MechanicalODE, allowed_contradiction
-from .sparse_normals import SparseNormals
+from .sparse_constraint_jacobian import SparseConstraintJacobian
 
 
 # A drift that counts as large as the solution itself, as a part of this: the distance to |q| = 1 is nowhere more than |q|/2.
@@ -110,9 +110,9 @@ def redundancy(ode: MechanicalODE, t: Time, y: Phase) -> Redundancy:
 
 def weakest(ode: MechanicalODE, t: Time, y: Phase) -> Float[Array, ""]:
     """The smallest pivot of A Aᵀ for rows of length 1: of round-off size where constraints depend on each other."""
-    if isinstance(ode.linear, SparseNormals):
+    if isinstance(ode.linear, SparseConstraintJacobian):
         ones = jnp.ones(ode.holonomic, y[0].dtype)
-        regular = jnp.all(jnp.isfinite(ode.linear.gram_solve(ode, ode.normals(t, y), ones)))
+        regular = jnp.all(jnp.isfinite(ode.linear.schur_solve(ode, ode.jacobian(t, y), ones)))
         return jnp.where(regular, 1.0, 0.0).astype(y[0].dtype)
     a, _ = unit_rows(ode, t, y)
     return smallest_pivot(jnp.sum(a[:, None] * a, -1))
@@ -223,7 +223,7 @@ def passes_singularity(ode: MechanicalODE, t0: Time, y0: Phase, t1: Time, y1: Ph
     `drifts`, also whether the drift off the holonomic ones may have led past one.
     """
     a0, a1 = ode.constraint_jacobian(t0, *y0), ode.constraint_jacobian(t1, *y1)
-    _, lifted, scale = _gram(ode, y0, a0)
+    _, lifted, scale = _schur_complement(ode, y0, a0)
     turned = _is_turned(row_products(a1, lifted), scale, ode.rank and ode.rank[1])
     return turned | _drifted_over(ode, t1, y1, a1[: ode.holonomic]) if drifts and ode.holonomic else turned
 
@@ -233,24 +233,24 @@ def _drifted_over(ode: MechanicalODE, t: Time, y: Phase, g: Float[Array, "m n"])
     are as different as if a configuration in which they depend on each other were near: det(G M⁻¹Gᵀ + c (G′ − G) M⁻¹Gᵀ) < 0 for a
     large c, of either sign. The drift may then have led to another branch of the motion.
     """
-    gram, lifted, scale = _gram(ode, y, g)
+    schur, lifted, scale = _schur_complement(ode, y, g)
     rank = None if ode.rank is None else ode.rank[0]
     off = ode.constraint(t, y[0])
     if rank is None:
-        multipliers = semidefinite_solve(gram, off)
+        multipliers = semidefinite_solve(schur, off)
     else:
-        scaled = gram * scale[:, None] * scale
+        scaled = schur * scale[:, None] * scale
         multipliers = scale * solve_with(factorised(scaled, ((len(g), rank),)), scaled, scale * off)
     nearest = y[0] - matvec(lifted.T, multipliers)
-    change = row_products(jax.jacfwd(ode.constraint, 1)(t, nearest), lifted) - gram
-    return _is_turned(gram + FAR * change, scale, rank) | _is_turned(gram - FAR * change, scale, rank)
+    change = row_products(jax.jacfwd(ode.constraint, 1)(t, nearest), lifted) - schur
+    return _is_turned(schur + FAR * change, scale, rank) | _is_turned(schur - FAR * change, scale, rank)
 
 
-def _gram(ode: MechanicalODE, y: Phase, g: Float[Array, "m n"]) -> tuple[Array, Array, Array]:
+def _schur_complement(ode: MechanicalODE, y: Phase, g: Float[Array, "m n"]) -> tuple[Array, Array, Array]:
     """G M⁻¹Gᵀ, G M⁻¹, and what makes the diagonal of the first 1."""
     lifted = mass_solve(ode.mass(y[0]), g.T).T
-    gram = row_products(g, lifted)
-    return gram, lifted, unit_diagonal(gram)
+    schur = row_products(g, lifted)
+    return schur, lifted, unit_diagonal(schur)
 
 
 def _is_turned(product: Float[Array, "m m"], scale: Float[Array, " m"], rank: int | None) -> Bool[Array, ""]:

@@ -36,7 +36,7 @@ def equation_drift(system: System, t: Time, state: State, args: Args) -> tuple[F
     t = jnp.asarray(t, y.dtype)
     linearised = LinearisedResidual.of(form, y)
     if not linearised.structure.hidden:
-        return (jnp.max(jnp.abs(linearised.residual(t, y, linearised.rates(t, y)))),)
+        return (jnp.max(jnp.abs(linearised.residual(t, y, linearised.ydot(t, y)))),)
     ode = StructuralODE.of(form, y.dtype, complete=True)
     if ode.sparse is not None:
         # All levels at once: the derivatives with which they are least together.
@@ -52,7 +52,7 @@ def _with_derivatives(ode: StructuralODE, t: Time, y: Float[Array, " n"]) -> Flo
         return state
 
     def correct(_: IntScalar, state: Float[Array, " N"]) -> Any:
-        slopes, levels = ode.normals(t, state)[:, free], ode.invariants(t, state)
+        slopes, levels = ode.jacobian(t, state)[:, free], ode.invariants(t, state)
         step, open_directions, first = jnp.zeros(free.size, y.dtype), jnp.eye(free.size, dtype=y.dtype), 0
         for level in levels:
             rows = slopes[first : first + level.size]

@@ -176,7 +176,7 @@ class ResidualForm(eqx.Module):
         """Whether the user said what ẏ is near at the start."""
         return is_implicit(self.system) and self.system.yd0 is not None
 
-    def known_rates(self, y: Float[Array, " n"]) -> Float[Array, " n"]:
+    def known_ydot(self, y: Float[Array, " n"]) -> Float[Array, " n"]:
         """What is known of ẏ: what the user said of it, else nothing, 0."""
         if is_implicit(self.system) and self.system.yd0 is not None:
             return self.layout.flatten(self.system.yd0).astype(y.dtype)
@@ -188,10 +188,10 @@ class ResidualForm(eqx.Module):
         system = self.system
         if is_mechanism(system):
             return self._mechanical(t, y, yd)
-        state, rates = self.layout.unflatten(y), self.layout.unflatten(yd)
+        state, ydot = self.layout.unflatten(y), self.layout.unflatten(yd)
         if is_implicit(system):
-            return _flat(system.residual(t, state, rates, self.args), y.dtype)
-        (x, z), (xd, _) = state, rates
+            return _flat(system.residual(t, state, ydot, self.args), y.dtype)
+        (x, z), (xd, _) = state, ydot
         f = system.f(t, x, z, self.args)
         return jnp.concatenate([_flat(xd, y.dtype) - _flat(f, y.dtype), _flat(system.g(t, x, z, self.args), y.dtype)])
 

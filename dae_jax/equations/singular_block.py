@@ -29,7 +29,7 @@ def singular_block(system: System, t: Time, state: State, args: Args) -> str:
         linearised = LinearisedResidual.of(form, y)
     except ValueError:
         return ""
-    j, m = linearised.jacobians(t, y, linearised.rates(t, y))
+    j, m = linearised.jacobians(t, y, linearised.ydot(t, y))
     scaled = linearised.storage.scale_columns(j + m / STEP, linearised.column_scale(jnp.asarray(STEP, y.dtype)))
     rows, columns = (np.ravel(x) for x in linearised.storage.positions())
     found = _block(rows, columns, np.ravel(np.asarray(scaled)), y.size)

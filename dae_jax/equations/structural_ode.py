@@ -44,7 +44,7 @@ from .taylor import total_derivatives
 
 # Gauss–Newton's method for what is left of H at the initial state.
 STARTING = 100
-# The normals are a chart's directions while less than this part of one turns in a step.
+# The rows of the Jacobian are a chart's directions while less than this part of one turns in a step.
 TURNS = 0.05
 # With more equations, or constraints, a determinant takes longer than a step.
 ORIENTED = 32
@@ -207,20 +207,20 @@ class StructuralODE(ManifoldODE):
         return jnp.concatenate(self.invariants(t, y))
 
     @at_one_instant
-    def normals(self, t: Time, y: Float[Array, " N"]) -> Float[Array, "m N"]:
+    def jacobian(self, t: Time, y: Float[Array, " N"]) -> Float[Array, "m N"]:
         """∂H/∂Y, whose rows, times the `metric`, are normal to the manifold in it."""
         return jax.jacfwd(self.violations, 1)(t, y)
 
-    def lasting_normals(
+    def lasting_jacobian(
         self, t0: Time, y0: Float[Array, " N"], t1: Time, ahead: Float[Array, " N"]
     ) -> Float[Array, "m N"]:
-        """The normals, or, where one leads away from the manifold within some such steps, as with units that are far apart, their
+        """The Jacobian, or, where a row of it leads away from the manifold within some such steps, as with units that are far apart, their
         entries that last.
         """
-        here = self.normals(t0, y0)
+        here = self.jacobian(t0, y0)
         if not len(here):
             return here
-        there = lax.stop_gradient(self.normals(t1, ahead))
+        there = lax.stop_gradient(self.jacobian(t1, ahead))
         moves = self._moves(here)
         along = jnp.abs(jnp.sum((there - here) * moves, 1)) / jnp.sum(here * moves, 1)
         return jnp.where(jnp.any(along > TURNS), lasting(here, there), here)
@@ -230,44 +230,44 @@ class StructuralODE(ManifoldODE):
         if self.sparse is not None:
             entries = jnp.abs(self.sparse.entries(self, t, y))
             return [self.sparse.row_sums(entries * s[self.sparse.columns]) for s in of]
-        entries = jnp.abs(self.normals(t, y))
+        entries = jnp.abs(self.jacobian(t, y))
         return [jnp.sum(entries * s, 1) for s in of]
 
-    def tangent(self, dy: Float[Array, " N"], normals: Float[Array, "m N"]) -> Any:
-        if not len(normals):
+    def tangent(self, dy: Float[Array, " N"], jacobian: Float[Array, "m N"]) -> Any:
+        if not len(jacobian):
             return dy
-        gram = row_products(normals, self._moves(normals))
-        return dy - self.displace(0, normals, semidefinite_solve(gram, jnp.sum(normals * dy, 1)))
+        schur = row_products(jacobian, self._moves(jacobian))
+        return dy - self.displace(0, jacobian, semidefinite_solve(schur, jnp.sum(jacobian * dy, 1)))
 
-    def displace(self, y: Float[Array, " N"] | float, normals: Float[Array, "m N"], mu: Float[Array, " m"]) -> Any:
-        return y + jnp.sum(self._moves(normals) * mu[:, None], 0)
+    def displace(self, y: Float[Array, " N"] | float, jacobian: Float[Array, "m N"], mu: Float[Array, " m"]) -> Any:
+        return y + jnp.sum(self._moves(jacobian) * mu[:, None], 0)
 
-    def _moves(self, normals: Float[Array, "m N"]) -> Float[Array, "m N"]:
-        """What leads along the normals."""
-        return normals if self.metric is None else normals * self.metric
+    def _moves(self, jacobian: Float[Array, "m N"]) -> Float[Array, "m N"]:
+        """What leads along the rows of the Jacobian."""
+        return jacobian if self.metric is None else jacobian * self.metric
 
     def retract_along(
-        self, t: Time, y: Float[Array, " N"], normals: Float[Array, "m N"], bend: float | None = None
+        self, t: Time, y: Float[Array, " N"], jacobian: Float[Array, "m N"], bend: float | None = None
     ) -> tuple[Any, Bool[Array, ""]]:
         """`bend`: found only if Newton's first correction misses no more than this part of the way, as it does where
         another root is as near.
         """
-        if not len(normals):
+        if not len(jacobian):
             return y, jnp.asarray(True)
         noise, amplified = OFF * float(jnp.finfo(y.dtype).eps), amplified_roundoff(y.dtype)
 
         def iterate(params: PyTree) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
-            ode, t, y, normals = params
+            ode, t, y, jacobian = params
 
             def correct(mu: Float[Array, " m"]) -> tuple[Any, Any]:
-                here = ode.displace(y, normals, mu)
-                off, across = ode.violations(t, here), ode.normals(t, here)
-                delta = solve(row_products(across, ode._moves(normals)), off)
-                size = relative_change(ode.displace(0, normals, delta), here)
+                here = ode.displace(y, jacobian, mu)
+                off, across = ode.violations(t, here), ode.jacobian(t, here)
+                delta = solve(row_products(across, ode._moves(jacobian)), off)
+                size = relative_change(ode.displace(0, jacobian, delta), here)
                 settled = jnp.all(jnp.abs(off) <= noise * row_products(jnp.abs(across), jnp.abs(here)[None])[:, 0])
                 return mu - delta, jnp.where(settled & (size < amplified), 0, size)
 
-            start = jnp.zeros(len(normals), y.dtype)
+            start = jnp.zeros(len(jacobian), y.dtype)
             if bend is None:
                 return fixed_point(correct, start)
 
@@ -276,12 +276,12 @@ class StructuralODE(ManifoldODE):
                 return (mu, jnp.where(jnp.any(first != 0), first, mu)), size
 
             (mu, first), found = fixed_point(also_first, (start, start))
-            length = lambda mu: jnp.max(jnp.abs(ode.displace(0, normals, mu)))
+            length = lambda mu: jnp.max(jnp.abs(ode.displace(0, jacobian, mu)))
             return mu, found & (length(mu - first) <= bend * length(mu) + amplified)
 
         residual = lambda mu, params: params[0].violations(params[1], params[0].displace(params[2], params[3], mu))
-        mu, found = implicit_root(residual, iterate, (self, t, y, normals))
-        return self.displace(y, normals, mu), found
+        mu, found = implicit_root(residual, iterate, (self, t, y, jacobian))
+        return self.displace(y, jacobian, mu), found
 
     # The user's state
 
@@ -316,13 +316,13 @@ class StructuralODE(ManifoldODE):
         t: Time,
         values: Float[Array, " n"],
         freedom: Float[Array, " n"] | None,
-        rates: Float[Array, " n"] | None = None,
+        ydot: Float[Array, " n"] | None = None,
         counted: Bool[Array, " n"] | None = None,
     ) -> Float[Array, " N"]:
         """Y near the values of the variables, each of which may move as much as its `freedom` says (0: not at all; 1: no
         more than the others; `None`: none moves), with the least H; those that are not `counted` (`None`: all are) move for nothing.
         Gauss–Newton's method; the derivatives from 0, the first ones from what is known of them or, where F is nonlinear in them, from
-        such as satisfy it; these are `rates` where that is given.
+        such as satisfy it; these are `ydot` where that is given.
         """
         index, dtype = self.orders.values, values.dtype
         moves = take(jnp.zeros_like(values) if freedom is None else freedom.astype(dtype), index)
@@ -330,13 +330,13 @@ class StructuralODE(ManifoldODE):
         weights = jnp.where(counts > 0, moves, jnp.where(jnp.asarray(index < 0) | (moves > 0), FREE, 0))
         known = take(values, index)
         first = self.orders.first_derivatives
-        if rates is not None:
+        if ydot is not None:
             weights = jnp.where(first < 0, weights, 0)
         elif is_nonlinear(self.form, values.dtype):
-            rates = rates_of(self.form, t, values)[0]
+            ydot = rates_of(self.form, t, values)[0]
         else:
-            rates = self.form.known_rates(values)
-        known = known + take(rates, first)
+            ydot = self.form.known_ydot(values)
+        known = known + take(ydot, first)
         return _nearest(self, t, known, weights, counts, freedom is not None)
 
 
@@ -356,7 +356,7 @@ def _nearest(
         ode, t, _, weights, counts, *_ = params
         if ode.sparse is not None:
             return ode.sparse.nearest(ode, t, y, aim, weights, counts == 0)
-        a, h = ode.normals(t, y), ode.violations(t, y)
+        a, h = ode.jacobian(t, y), ode.violations(t, y)
         return aim + step_to(a, h + jnp.sum(a * (aim - y), 1), weights, counts == 0)
 
     def settled(y: Float[Array, " N"], aims: Callable[[Array], Array], params: PyTree) -> Any:

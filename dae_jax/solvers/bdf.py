@@ -214,7 +214,7 @@ class BDF(Replayable, AbstractResidualSolver):
         if made_jump is not False:
             state = lax.cond(
                 made_jump,
-                lambda: _start(sign * constant(args.rates(sign * t0, y0)), state.factors, state.work),
+                lambda: _start(sign * constant(args.ydot(sign * t0, y0)), state.factors, state.work),
                 lambda: state,
             )
         tol = tolerances(self.rtol, self.atol, y0.dtype).waiting(args.patient)
@@ -307,13 +307,13 @@ def _differences(change: Any, star: list[Any], k: Any) -> tuple[Any, list[Any]]:
     return change, phi[:0:-1]
 
 
-def _start(rates: Float[Array, " n"], factors: Any, work: Work) -> _State:
+def _start(ydot: Float[Array, " n"], factors: Any, work: Work) -> _State:
     """No history: φ₁ is dy/dτ, to be multiplied by the size of the first step. It predicts only."""
-    zero, count = jnp.zeros((), rates.dtype), jnp.zeros((), int)
-    phi = jnp.stack([rates] + [jnp.zeros_like(rates)] * (MAX_ORDER - 1))
+    zero, count = jnp.zeros((), ydot.dtype), jnp.zeros((), int)
+    phi = jnp.stack([ydot] + [jnp.zeros_like(ydot)] * (MAX_ORDER - 1))
     return _State(
         phi,
-        jnp.ones(len(ROWS), rates.dtype),
+        jnp.ones(len(ROWS), ydot.dtype),
         count,
         count + 1,
         count,

@@ -24,20 +24,20 @@ class ChartPoint(eqx.Module):
     """A point of a step's chart, with the directions that lead back on to the manifold."""
 
     y: Any
-    normals: Any
+    jacobian: Any
 
 
 class _Interpolation(diffrax.AbstractLocalInterpolation):
     t0: Any
     t1: Any
     inner: Any
-    normals: Any
+    jacobian: Any
     cls: Any = eqx.field(static=True)
 
     def evaluate(self, t0: Time, t1: Any = None, left: bool = True) -> Any:
         if t1 is not None:
             return jax.tree.map(lambda a, b: b - a, self.evaluate(t0), self.evaluate(t1))
-        return ChartPoint(self.cls(t0=self.t0, t1=self.t1, **self.inner).evaluate(t0), self.normals)
+        return ChartPoint(self.cls(t0=self.t0, t1=self.t1, **self.inner).evaluate(t0), self.jacobian)
 
 
 class AbstractChartSolver(AbstractManifoldSolver, diffrax.AbstractAdaptiveSolver):
@@ -65,7 +65,7 @@ class AbstractChartSolver(AbstractManifoldSolver, diffrax.AbstractAdaptiveSolver
     @property
     def interpolation_cls(self) -> Any:
         inner = self.solver.interpolation_cls
-        return lambda t0, t1, inner_info, normals: _Interpolation(t0, t1, inner_info, normals, inner)
+        return lambda t0, t1, inner_info, jacobian: _Interpolation(t0, t1, inner_info, jacobian, inner)
 
     @abc.abstractmethod
     def along(self, dy: Y, chart: Any, ode: Any) -> Any:
@@ -107,17 +107,17 @@ class AbstractChartSolver(AbstractManifoldSolver, diffrax.AbstractAdaptiveSolver
         end = terms.vf(t1, y1, args)
         if error is not None:
             error = or_nan(found & ~_jumps(y0, y1, derivative, end, terms.contr(t0, t1)), error)
-        info = {"inner_info": dense, "normals": chart}
+        info = {"inner_info": dense, "jacobian": chart}
         return y1, error, info, end, outcome(found)
 
     def retract(self, t: Any, y: Any, ode: Any) -> Any:
         if not isinstance(y, ChartPoint):
             return y
-        y, found = self.lift(t, y.y, y.normals, ode, between=True)
+        y, found = self.lift(t, y.y, y.jacobian, ode, between=True)
         return or_nan(found, y)
 
     def whole_path(self, path: diffrax.DenseInterpolation) -> diffrax.DenseInterpolation:
-        first = ChartPoint(path.y0_if_trivial, jax.tree.map(lambda x: x[0], path.infos["normals"]))
+        first = ChartPoint(path.y0_if_trivial, jax.tree.map(lambda x: x[0], path.infos["jacobian"]))
         return eqx.tree_at(lambda p: p.y0_if_trivial, path, first)
 
     def _field(self, terms: diffrax.AbstractTerm, sign: Any, ode: Any, chart: Any, t: Any, u: Any) -> Any:

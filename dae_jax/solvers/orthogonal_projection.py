@@ -30,7 +30,7 @@ class OrthogonalProjection(AbstractWrapper, AbstractManifoldSolver):
 
         ỹ = Φ_h(y₀),   y₁ = ỹ + N(ỹ) μ,   H(t₁, y₁) = 0,
 
-    with the normals N = M⁻¹Aᵀ in the metric of the mass matrix, taken at ỹ (which is nearest to within the square of
+    with N = M⁻¹Aᵀ of the constraint Jacobian A, taken at ỹ (which is nearest to within the square of
     the step's error). Positions are projected first, velocities at the new position next. The order of `solver` is
     kept, and so is its stability; a first integral that `solver` keeps may be lost: with explicit Euler the pendulum's
     speed grows. The error of a step is that of `solver`, or N μ where that is more.

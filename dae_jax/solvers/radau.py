@@ -48,7 +48,7 @@ else:
 # The Jacobian is kept for the next step while Newton's method contracts faster than this.
 FAST = 1e-2
 # As many more corrections for each stage more than three (the program RADAU).
-PATIENCE = 2.5
+CORRECTIONS_PER_STAGE = 2.5
 # By which diffrax lets a step grow at most.
 GROWTH = 10
 # Where a factorisation takes as long as many steps, a step that could grow by no more than this keeps its size (the program
@@ -63,14 +63,14 @@ SLOW, CAREFUL = 0.1, 1.5
 class RadauState(NamedTuple):
     """What a step leaves to the next.
 
-    `z`, `h`: stages and size of the last step, h = 0 before the first; `rates`: ẏ at its end; `jacobians`, `factors`
+    `z`, `h`: stages and size of the last step, h = 0 before the first; `ydot`: ẏ at its end; `jacobians`, `factors`
     (for the size `factored`); `refresh`: whether the Jacobians are to be evaluated anew; `eta`: θ/(1 − θ) of Newton's
     method; `work`: what has been done.
     """
 
     z: Float[Array, "s n"]
     h: Float[Array, ""]
-    rates: Float[Array, " n"]
+    ydot: Float[Array, " n"]
     jacobians: Any
     factors: Any
     factored: Float[Array, ""]
@@ -103,7 +103,7 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
     def fitted_tolerances(self, dtype: Any) -> Tolerances:
         """Those of the controller, with patience for the number of stages."""
         tol = tolerances(self.rtol, self.atol, dtype)
-        return tol._replace(corrections=tol.corrections + int(PATIENCE * (self.stages - 3)))
+        return tol._replace(corrections=tol.corrections + int(CORRECTIONS_PER_STAGE * (self.stages - 3)))
 
     def init(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any) -> RadauState:
         sign = time_sign(terms, t0, t1)
@@ -151,9 +151,9 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
                 felt(embedded(step, constant(factors.real), z, tol)[1], y0, y1, step.h >= args.felt, tol.rtol, tol.atol)
             )
             counted = jnp.where(jnp.abs(seen) > jnp.abs(counted), seen, counted)
-        rates, smallest = step.stages(z)[-1][2], step.smallest
+        ydot, smallest = step.stages(z)[-1][2], step.smallest
         # What is algebraic may jump in the smallest step.
-        bend = constant((rates - state.rates) * (step.h / 2)) * args.structure.differential
+        bend = constant((ydot - state.ydot) * (step.h / 2)) * args.structure.differential
         scaled = jnp.where(smallest, bend, counted)
         error = constant(tol.norm(scaled, y0, y1))
         failure = of_step(newton.converged, factors.probe.determined, error)
@@ -162,7 +162,7 @@ class AbstractRadauIIA(Replayable, AbstractResidualSolver):
         slow = (newton.theta > FAST) & (newton.count > 1)
         # What jumped says nothing of the next step.
         size = jnp.where(smallest, 0, step.h)
-        new = RadauState(z, size, rates, jacobians, factors, size, slow, newton.eta, work)
+        new = RadauState(z, size, ydot, jacobians, factors, size, slow, newton.eta, work)
         return y1, scaled, {"y0": y0, "z": z}, constant(new), result
 
     def _held(self, linearised: Any, error: Any, newton: Newton) -> Any:
@@ -307,7 +307,7 @@ def _solve(step: Step, state: RadauState, tol: Tolerances) -> Any:
         start = start_of(tries, jnp.where(tries == 0, predicted, 0), before)
         at_end = smallest | before.converged
         t, y = jnp.where(at_end, step.t1, step.t0), jnp.where(at_end, step.y0 + start[-1], step.y0)
-        evaluate = lambda: step.jacobians(step.sign * t, y, state.rates)
+        evaluate = lambda: step.jacobians(step.sign * t, y, state.ydot)
         jacobians = lax.cond(renew, evaluate, lambda: jacobians)
         refactor = renew | (jnp.abs(h - state.factored) > ALIKE * h)
         factors = lax.cond(refactor, lambda: step.factor(jacobians, tol), lambda: factors)

@@ -65,18 +65,18 @@ class RATTLE(AbstractManifoldSolver):
         q0, v0 = y0
         t0_, t1_ = sign * t0, sign * t1
         half = v0 + h / 2 * _free(args, t0_, q0, v0)
-        chart = args.normals(t0_, y0)
+        chart = args.jacobian(t0_, y0)
         (q1, _), found = args.retract_along(t1_, (q0 + h * half, half), chart)
         half = (q1 - q0) / h
         free = half + h / 2 * _free(args, t1_, q1, half)
         # q₁ is on the manifold; what is restored is the velocity.
-        (_, v1), settled = args.retract_along(t1_, (q1, free), args.normals(t1_, (q1, free)))
+        (_, v1), settled = args.retract_along(t1_, (q1, free), args.jacobian(t1_, (q1, free)))
         found = found & settled
         y1 = or_nan(found, (q1, v1))
         return y1, None, hermite(terms, args, t0, t1, y0, y1), None, outcome(jnp.asarray(found))
 
     def retract(self, t: Time, y: Phase, ode: MechanicalODE) -> Any:
-        y, found = ode.retract_along(t, y, ode.normals(t, y))
+        y, found = ode.retract_along(t, y, ode.jacobian(t, y))
         return or_nan(found, y)
 
 

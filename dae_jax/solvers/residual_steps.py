@@ -347,7 +347,7 @@ def within(t: Any, t0: Any, t1: Any) -> Any:
     return jnp.where(t < t0, t0, jnp.where(t > t1, t1, t))
 
 
-def first_step(rates: Float[Array, " n"], solver: Any, t0: Any, t1: Any, y0: Float[Array, " n"]) -> Any:
+def first_step(ydot: Float[Array, " n"], solver: Any, t0: Any, t1: Any, y0: Float[Array, " n"]) -> Any:
     """The size of the first step, from ẏ at the start: no variable moves by more than half its tolerance in it, if time resolves that.
 
     Source: K. E. Brenan, S. L. Campbell, L. R. Petzold, *Numerical Solution of Initial-Value Problems in
@@ -355,7 +355,7 @@ def first_step(rates: Float[Array, " n"], solver: Any, t0: Any, t1: Any, y0: Flo
     """
     span = t1 - t0
     tol = tolerances(solver.rtol, solver.atol, y0.dtype)
-    speed = tol.norm(rates, y0)
+    speed = tol.norm(ydot, y0)
     resolved = 100 * jnp.finfo(y0.dtype).eps * jnp.abs(t0)
     step = jnp.minimum(1e-3 * jnp.abs(span), jnp.maximum(0.5 / jnp.maximum(speed, 1e-30), resolved))
     return lax.stop_gradient(jnp.sign(span) * step)

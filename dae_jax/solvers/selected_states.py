@@ -37,12 +37,12 @@ class Selection(NamedTuple):
 
 
 def _selected(
-    ode: StructuralODE, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, rates: Any, chosen: Any
+    ode: StructuralODE, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, ydot: Any, chosen: Any
 ) -> tuple[Any, Any, Any]:
     """The directions for the step from t₀ to t₁, whether they are not those `chosen` before, and the leading matrix at its start."""
     sign = time_sign(terms, t0, t1)
     start = ode.leading(sign * t0, y0)
-    ahead = ode.leading(sign * t1, y0 + terms.contr(t0, t1) * rates) if ode.varying else start
+    ahead = ode.leading(sign * t1, y0 + terms.contr(t0, t1) * ydot) if ode.varying else start
     return *selection(ode.orders, start, chosen, ahead), start
 
 
@@ -89,10 +89,10 @@ class SelectedStates(Replayable, AbstractChartSolver):
             if self.dense:
                 stays &= self._is_found_within(sign, t0, t1, dense, args)
             if error is not None:
-                normals = args.normals(sign * t1, y1)
-                stays &= _leads_back(args, sign * t1, y1, error, normals, directions)
+                jacobian = args.jacobian(sign * t1, y1)
+                stays &= _leads_back(args, sign * t1, y1, error, jacobian, directions)
                 # Entries that are not integrated are off by what follows from the error of the others.
-                follows = solve(row_products(normals, directions), jnp.sum(normals * error, 1))
+                follows = solve(row_products(jacobian, directions), jnp.sum(jacobian * error, 1))
                 error = or_nan(stays, error - jnp.sum(directions * follows[:, None], 0))
             y1, result = or_nan(stays, y1), diffrax.RESULTS.where(stays, result, outcome(stays))
         return y1, error, dense, Selection(derivative, directions, solver_state.switches + switched), result
@@ -108,21 +108,21 @@ class SelectedStates(Replayable, AbstractChartSolver):
         for part in WITHIN:
             t = t0 + part * (t1 - t0)
             point = path.evaluate(t)
-            found.append(self.lift(sign * t, point.y, point.normals, ode)[1])
+            found.append(self.lift(sign * t, point.y, point.jacobian, ode)[1])
         return jnp.all(jnp.stack(found))
 
     def replay(
         self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Any, args: Any, history: Any, dense: Any
     ) -> Any:
         derivative = terms.vf(t0, y0, args)
-        y1, _, dense, *_ = self.step_in(dense["normals"], terms, t0, t1, y0, args, derivative, False)
+        y1, _, dense, *_ = self.step_in(dense["jacobian"], terms, t0, t1, y0, args, derivative, False)
         return y1, history, dense
 
 
-def _leads_back(ode: StructuralODE, t: Time, y: Any, error: Any, normals: Any, directions: Any) -> Any:
+def _leads_back(ode: StructuralODE, t: Time, y: Any, error: Any, jacobian: Any, directions: Any) -> Any:
     """Whether Newton's method leads back to y from as far off as the error, or as round-off, to either side."""
-    matrix = row_products(normals, directions)
-    terms = row_products(jnp.abs(normals), jnp.abs(y)[None])[:, 0]
+    matrix = row_products(jacobian, directions)
+    terms = row_products(jnp.abs(jacobian), jnp.abs(y)[None])[:, 0]
     round_off = OFF * float(jnp.finfo(y.dtype).eps) * jnp.abs(solve(matrix, terms))
     off = jnp.abs(jnp.sum(directions * error, 1)) + round_off
     found = []
@@ -182,8 +182,8 @@ class SelectedResiduals(Replayable, AbstractResidualSolver):
         made_jump: BoolLike,
     ) -> Any:
         ode, sign = args.form.ode, time_sign(terms, t0, t1)
-        y, rates = (x[: ode.orders.size] for x in (y0, args.form.known_rates(y0)))
-        directions, switched, start = _selected(ode, terms, t0, t1, y, rates, solver_state.directions)
+        y, ydot = (x[: ode.orders.size] for x in (y0, args.form.known_ydot(y0)))
+        directions, switched, start = _selected(ode, terms, t0, t1, y, ydot, solver_state.directions)
         solver = dataclasses.replace(self.solver, rtol=self.rtol, atol=self.atol)
         state = jax.tree.map(
             lambda a, b: jnp.where(switched, a, b), self.invalidate_jacobian(solver_state), solver_state

@@ -69,9 +69,9 @@ class SymmetricProjection(AbstractManifoldSolver):
             terms, args, t0, t1, y0, lengths = params
             sign = time_sign(terms, t0, t1)
             z, y1, mu = x[:stages], unravel(x[stages : stages + flat.size]), x[stages + flat.size :] / lengths
-            start = args.displace(y0, args.normals(sign * t0, y0), mu)
+            start = args.displace(y0, args.jacobian(sign * t0, y0), mu)
             end = stage_end(tableau, terms, args, t0, t1, start, z)
-            projected = args.displace(end, args.normals(sign * t1, y1), mu)
+            projected = args.displace(end, args.jacobian(sign * t1, y1), mu)
             return jnp.concatenate(
                 [
                     stage_residual(tableau, terms, args, t0, t1, start, z),
@@ -82,8 +82,8 @@ class SymmetricProjection(AbstractManifoldSolver):
 
         zero = jnp.zeros(sum(level.size for level in levels), flat.dtype)
         # The unknown is N μ over the length of N, a part of y: with heavy masses or small constraints μ itself is large.
-        normals = args.normals(time_sign(terms, t0, t1) * t0, y0)
-        moved = jax.jacfwd(lambda mu: ravel_pytree(args.displace(y0, normals, mu))[0])(zero)
+        jacobian = args.jacobian(time_sign(terms, t0, t1) * t0, y0)
+        moved = jax.jacfwd(lambda mu: ravel_pytree(args.displace(y0, jacobian, mu))[0])(zero)
         lengths = jnp.max(jnp.abs(moved), 0)
         lengths = jax.lax.stop_gradient(jnp.where(lengths > 0, lengths, 1))
         params = (terms, args, t0, t1, y0, lengths)

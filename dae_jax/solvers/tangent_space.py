@@ -15,7 +15,7 @@ from .manifold import time_sign
 class TangentSpace(AbstractChartSolver):
     """A step of an explicit solver in the coordinates of the tangent space at the step's start.
 
-    With the normals N = M⁻¹Aᵀ at y₀ = (q₀, v₀) and the projection P = I − N(AN)⁻¹A along them (orthogonal in the metric
+    With N = M⁻¹Aᵀ of the constraint Jacobian A at y₀ = (q₀, v₀) and the projection P = I − N(AN)⁻¹A along N (orthogonal in the metric
     of the mass matrix), a point of the manifold near y₀ is u = q₀ + P(q − q₀), w = P v, and
 
         u̇ = P v,   ẇ = P v̇,   q = u + N ν with g(t, q) = 0,   v = w + N κ with A(q) v + g_t = 0.
@@ -49,5 +49,5 @@ class TangentSpace(AbstractChartSolver):
     ) -> Any:
         sign, h = time_sign(terms, t0, t1), terms.contr(t0, t1)
         ahead = jax.tree.map(lambda y, rate: y + h * rate, y0, solver_state)
-        chart = args.lasting_normals(sign * t0, y0, sign * t1, ahead)
+        chart = args.lasting_jacobian(sign * t0, y0, sign * t1, ahead)
         return self.step_in(chart, terms, t0, t1, y0, args, solver_state, made_jump)

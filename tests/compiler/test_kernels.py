@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import dae_jax
-from dae_jax.compiler import configure, hindrances, one_kernel, polynomials, scalarise, subroutine, xla_kernel
+from dae_jax.compiler import configure, one_kernel, polynomials, scalarise, subroutine, unsupported, xla_kernel
 from dae_jax.compiler.emit import programs
 from dae_jax.compiler.jaxprs.scalar_interpreter import Unsupported
 from dae_jax.compiler.lower import judge
@@ -241,9 +241,9 @@ def spd(x):
     return jnp.eye(4) + jnp.outer(x, x)
 
 
-class TestHindrances:
+class TestUnsupported:
     def test_plain_arithmetic_has_none(self):
-        assert hindrances(jax.make_jaxpr(loop)(X)) == ()
+        assert unsupported(jax.make_jaxpr(loop)(X)) == ()
 
     @pytest.mark.parametrize(
         ("fn", "name"),
@@ -258,17 +258,21 @@ class TestHindrances:
             return jax.lax.fori_loop(0, 3, lambda _, y: jax.lax.cond(y[0] > 0, jax.jit(fn), lambda z: 2 * z, y * 1), x)
 
         if name == "svd":
-            assert hindrances(jax.make_jaxpr(fn)(X)) == (name,)
+            assert unsupported(jax.make_jaxpr(fn)(X)) == (name,)
         else:
-            assert hindrances(jax.make_jaxpr(deep)(X)) == (name,)
+            assert unsupported(jax.make_jaxpr(deep)(X)) == (name,)
+
+    def test_the_former_name_says_so(self):
+        with pytest.warns(DeprecationWarning, match="is called `compiler.unsupported`"):
+            assert dae_jax.compiler.hindrances(jax.make_jaxpr(loop)(X)) == ()
 
     def test_one_scatter_window_does_not_hinder(self):
-        assert hindrances(jax.make_jaxpr(lambda x: x.at[1].set(0))(X)) == ()
+        assert unsupported(jax.make_jaxpr(lambda x: x.at[1].set(0))(X)) == ()
 
     def test_several_scatter_windows_hinder_xla(self):
         several = jax.make_jaxpr(lambda x: x.at[jnp.array([0, 2])].set(0))(X)
-        assert hindrances(several) == ()
-        assert xla_kernel.hindrances(several) == ("scatter",)
+        assert unsupported(several) == ()
+        assert xla_kernel.unsupported(several) == ("scatter",)
 
 
 def is_marked(fn, *args):

@@ -8,7 +8,7 @@ import pytest
 
 import dae_jax
 from dae_jax.compiler import polynomials, scalarise
-from dae_jax.compiler.lower import compiled, hindrances
+from dae_jax.compiler.lower import compiled, unsupported
 from dae_jax.structure import dependence
 
 
@@ -75,7 +75,7 @@ def joined(fn):
 class TestEmpty:
     def test_native(self, fn):
         jaxpr = jax.make_jaxpr(flat(fn))(X)
-        assert hindrances(jaxpr) == ()
+        assert unsupported(jaxpr) == ()
         xs = jnp.stack([X, 2 * X, -X])
         for found, expected in (
             (jax.jit(compiled(jaxpr))(X), flat(fn)(X)),

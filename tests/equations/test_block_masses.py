@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import dae_jax
-from dae_jax.equations.constraint_jacobian import DenseNormals, dense_mass
+from dae_jax.equations.constraint_jacobian import DenseConstraintJacobian, dense_mass
 from dae_jax.equations.mechanical import MechanicalODE
-from dae_jax.equations.sparse_normals import SparseNormals
+from dae_jax.equations.sparse_constraint_jacobian import SparseConstraintJacobian
 
 
 BODIES = 8
@@ -32,7 +32,7 @@ def chain(mass, links: int) -> dae_jax.ConstrainedSystem:
     return dae_jax.ConstrainedSystem(lambda t, q, v, args: jnp.cos(q) - v, constraint, mass=mass)
 
 
-@pytest.mark.parametrize(("links", "linear"), [(2, DenseNormals), (7, SparseNormals)])
+@pytest.mark.parametrize(("links", "linear"), [(2, DenseConstraintJacobian), (7, SparseConstraintJacobian)])
 def test_the_field_and_the_way_to_the_manifold_are_those_of_the_dense_matrix(links, linear):
     rng = np.random.default_rng(0)
     q, v = jnp.asarray(rng.normal(size=(2, 3 * BODIES)))

@@ -11,7 +11,7 @@ import dae_jax
 from dae_jax import mechanisms as m
 from dae_jax.compiler import kernel_call
 from dae_jax.equations.mechanical import MechanicalODE
-from dae_jax.equations.sparse_normals import SparseNormals
+from dae_jax.equations.sparse_constraint_jacobian import SparseConstraintJacobian
 from dae_jax.linalg import SparseDefinite
 
 
@@ -91,9 +91,9 @@ def test_a_stewart_platform_stays_closed_and_keeps_its_energy(monkeypatch):
     # One kernel, in which what is evaluated again and again is written once, and no dense system of 85.
     monkeypatch.setattr(kernel_call, "_by_xla", lambda *_: pytest.fail("left to XLA"))
     linear = MechanicalODE.of(mechanism.system(), 0.0, y0, None).linear
-    assert isinstance(linear, SparseNormals)
-    assert isinstance(linear.gram, SparseDefinite)
-    assert linear.gram.symbolic.cost < 85**3 / 100
+    assert isinstance(linear, SparseConstraintJacobian)
+    assert isinstance(linear.schur, SparseDefinite)
+    assert linear.schur.symbolic.cost < 85**3 / 100
     sol = dae_jax.daesolve(
         mechanism.system(),
         SOLVER,

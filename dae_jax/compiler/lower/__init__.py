@@ -2,5 +2,5 @@
 
 from .annotated import Annotated as Annotated
 from .judge import annotate as annotate, unsupported as unsupported
-from .module import compiled as compiled, hindrances as hindrances, written as written
+from .module import compiled as compiled, written as written
 from .uniformity import varying as varying

@@ -12,13 +12,8 @@ from jaxtyping import Array
 from ..emit import launch, register
 from ..emit.target import Target, host
 from ..jaxprs.scalar_interpreter import Unsupported
-from .judge import annotate, unsupported
+from .judge import annotate
 from .module_text import module_text
-
-
-def hindrances(jaxpr: ClosedJaxpr) -> tuple[str, ...]:
-    """The names of what keeps a function from being compiled here; empty if nothing does."""
-    return tuple(dict.fromkeys(found.primitive for found in unsupported(jaxpr)))
 
 
 def written(

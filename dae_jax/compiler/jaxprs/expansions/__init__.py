@@ -33,10 +33,10 @@ def _empty(*, dtype: DType, **_: object) -> Any:
     return jnp.zeros((), dtype)
 
 
-def kernel_written_out(*args: Array, jaxpr: ClosedJaxpr, lanes: tuple[bool, ...], **_: object) -> list[Any]:
+def kernel_written_out(*args: Array, jaxpr: ClosedJaxpr, batched: tuple[bool, ...], **_: object) -> list[Any]:
     """What a kernel computes, as the equations that it was made from; within another kernel it is a part of that."""
     fn: Callable[..., list[Any]] = jaxpr_as_fun(jaxpr)
-    return jax.vmap(fn, in_axes=[0 if b else None for b in lanes])(*args) if lanes else fn(*args)
+    return jax.vmap(fn, in_axes=[0 if b else None for b in batched])(*args) if batched else fn(*args)
 
 
 EXPANSIONS: dict[str, Callable[..., Any]] = {
@@ -68,7 +68,7 @@ def expanded(closed: ClosedJaxpr, checks: bool = True) -> ClosedJaxpr:
             return None
         if name in EXPANSIONS:
             return by_simpler_ones(eqn, EXPANSIONS)
-        if name == "one_kernel" and not eqn.params["lanes"]:
+        if name == "one_kernel" and not eqn.params["batched"]:
             return eqn.params["jaxpr"]
         if name != "one_kernel" and name not in _EVALUATED:
             return None

@@ -1,4 +1,4 @@
-"""The reverse derivative from a tape is that of diffrax's checkpoints."""
+"""The reverse derivative from the trajectory is that of diffrax's checkpoints."""
 
 import diffrax
 import jax
@@ -8,7 +8,7 @@ import pytest
 
 import dae_jax
 from dae_jax.compiler import equations
-from dae_jax.driver.trajectory_adjoint import LARGEST_OF_LARGE, can_be_taped
+from dae_jax.driver.trajectory_adjoint import LARGEST_OF_LARGE, has_trajectory_adjoint
 from dae_jax.scenes import chain, pendulum
 
 
@@ -59,10 +59,10 @@ def test_equals_diffrax_with_respect_to_everything(name, saveat, steps):
     x = jnp.array([1.2, 9.81, 1.0, 1.0, 1.0, 1.0])
     form = dae_jax.DummyDerivatives() if name == "selected states" else None
     solver = SOLVERS[name]
-    # The tape's steps are those of a derivative: equal up to the tolerance.
+    # The trajectory's steps are those of a derivative: equal up to the tolerance.
     tight = {"stepsize_controller": diffrax.PIDController(1e-11, 1e-11)} if steps == "adaptive" else {}
     of = lambda x, **options: loss(x, saveat, solver, dt0, *times, form, **tight, **options)
-    taped = jax.grad(of)(x)
+    inputs = jax.grad(of)(x)
     if name in BACKWARDS_BY_DIFFRAX:
         with dae_jax.configure(one_kernel=False):
             expected = jax.grad(of)(x)
@@ -70,8 +70,8 @@ def test_equals_diffrax_with_respect_to_everything(name, saveat, steps):
         expected = jax.jacfwd(lambda x: of(x, adjoint=diffrax.ForwardMode()))(x)
     assert np.abs(expected).max() > 0.1
     assert (expected[-1] != 0) == (dt0 is not None)
-    # For steps of sizes of their own, diffrax lets the start of the interval move all of them; so does the tape.
-    np.testing.assert_allclose(taped, expected, rtol=1e-8, atol=1e-9)
+    # For steps of sizes of their own, diffrax lets the start of the interval move all of them; so does ours.
+    np.testing.assert_allclose(inputs, expected, rtol=1e-8, atol=1e-9)
 
 
 def test_is_used_where_it_should_be():
@@ -79,8 +79,8 @@ def test_is_used_where_it_should_be():
         dae_jax.Differentiation(), dae_jax.DOP853(), diffrax.SaveAt(t1=True), diffrax.PIDController(1e-6, 1e-6),
         diffrax.RecursiveCheckpointAdjoint(), None, diffrax.NoProgressMeter(), 1000,
     )  # fmt: skip
-    assert can_be_taped(solve, 4)
-    assert not can_be_taped(solve, LARGEST_OF_LARGE // 1000)
+    assert has_trajectory_adjoint(solve, 4)
+    assert not has_trajectory_adjoint(solve, LARGEST_OF_LARGE // 1000)
     for name, value in {
         "saveat": diffrax.SaveAt(dense=True),
         "solver": diffrax.Kvaerno5(),
@@ -88,7 +88,7 @@ def test_is_used_where_it_should_be():
         "event": diffrax.Event(lambda t, y, args, **kwargs: y[0]),
     }.items():
         fields = {k: getattr(solve, k) for k in solve.__dataclass_fields__} | {name: value}
-        assert not can_be_taped(type(solve)(**fields), 4)
+        assert not has_trajectory_adjoint(type(solve)(**fields), 4)
 
 
 def test_gradient_of_a_long_chain_is_right():

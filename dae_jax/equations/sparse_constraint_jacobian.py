@@ -14,7 +14,7 @@ from ..structure import column_colouring, seed_matrix
 from ..types import Flat, Time
 from .constraint_jacobian import Mechanism, mass_solve
 from .directions import along_each
-from .manifold_ode import Normals, traced_once
+from .manifold_ode import ConstraintJacobian, traced_once
 
 
 # Systems with fewer constraints are dense: their elimination is straight-line code.
@@ -22,7 +22,7 @@ SPARSE_FROM = 5
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class SparseNormals:
+class SparseConstraintJacobian:
     """A by its nonzeros, for holonomic constraints and unit, diagonal or block-diagonal masses.
 
     A is compressed to C = A S, one directional derivative of the constraints a colour, in which row i has at most one
@@ -34,7 +34,7 @@ class SparseNormals:
 
     columns: Int[np.ndarray, "colours c"]
     seeds: Float[np.ndarray, "n colours"]
-    gram: Elimination | SparseDefinite
+    schur: Elimination | SparseDefinite
 
     @traced_once
     def at(self, ode: Mechanism, t: Time, q: Flat, v: Flat) -> tuple[Array | None, ...]:
@@ -45,9 +45,9 @@ class SparseNormals:
             seeds = _unweighted(mass, seeds)
         compressed = self._compressed(ode, t, q, seeds)
         point = jnp.asarray(t, q.dtype), q, mass, compressed
-        if not isinstance(self.gram, SparseDefinite):
+        if not isinstance(self.schur, SparseDefinite):
             return point
-        return *point, *self.gram.factors(*self._products(mass, compressed))
+        return *point, *self.schur.factors(*self._products(mass, compressed))
 
     def _compressed(
         self, ode: Mechanism, t: Time, q: Flat, seeds: Float[Array, "n colours"]
@@ -55,34 +55,34 @@ class SparseNormals:
         return along_each(functools.partial(ode.constraint, t), q, seeds)
 
     @traced_once
-    def along(self, ode: Mechanism, normals: Normals, x: Float[Array, " n"]) -> Float[Array, " c"]:
+    def along(self, ode: Mechanism, jacobian: ConstraintJacobian, x: Float[Array, " n"]) -> Float[Array, " c"]:
         """A x."""
-        t, q, *_ = normals
+        t, q, *_ = jacobian
         return jax.jvp(functools.partial(ode.constraint, t), (q,), (x,))[1]
 
-    def freed(self, ode: Mechanism, normals: Normals, q: Flat, force: Flat) -> Flat:
+    def freed(self, ode: Mechanism, jacobian: ConstraintJacobian, q: Flat, force: Flat) -> Flat:
         """M⁻¹ f."""
-        mass = normals[2]
+        mass = jacobian[2]
         if mass is None or mass.ndim < 3:
             return mass_solve(mass, force)
         half = jax.scipy.linalg.solve_triangular(mass, force.reshape(mass.shape[:2])[..., None], lower=True)
         return jax.scipy.linalg.solve_triangular(mass, half, trans=1, lower=True).reshape(force.shape)
 
     @traced_once
-    def lift(self, ode: Mechanism, normals: Normals, mu: Float[Array, " c"]) -> Float[Array, " n"]:
+    def lift(self, ode: Mechanism, jacobian: ConstraintJacobian, mu: Float[Array, " c"]) -> Float[Array, " n"]:
         """M⁻¹Aᵀ μ."""
-        t, q, *_ = normals
+        t, q, *_ = jacobian
         _, transpose = jax.vjp(functools.partial(ode.constraint, t), q)
-        return self.freed(ode, normals, q, transpose(mu)[0])
+        return self.freed(ode, jacobian, q, transpose(mu)[0])
 
     @traced_once
-    def gram_solve(self, ode: Mechanism, normals: Normals, b: Float[Array, " c"]) -> Float[Array, " c"]:
+    def schur_solve(self, ode: Mechanism, jacobian: ConstraintJacobian, b: Float[Array, " c"]) -> Float[Array, " c"]:
         """x with A M⁻¹Aᵀ x = b."""
-        _, _, mass, compressed, *factors = normals
+        _, _, mass, compressed, *factors = jacobian
         found = self._products(mass, compressed)
-        if isinstance(self.gram, SparseDefinite):
-            return self.gram.solve(*found, b, factors)
-        return self.gram.solve(*found, b)
+        if isinstance(self.schur, SparseDefinite):
+            return self.schur.solve(*found, b, factors)
+        return self.schur.solve(*found, b)
 
     def _products(
         self, mass: Float[Array, "..."] | None, compressed: Float[Array, "c colours"]
@@ -100,7 +100,7 @@ class SparseNormals:
     @functools.cached_property
     def _shared(self) -> list[tuple[Int[np.ndarray, " k"], Int[np.ndarray, "s k"], Int[np.ndarray, "s k"]]]:
         """The couplings of rows that share s columns, and where in C each of both rows has them: for each s that there is."""
-        rows, columns, colours = self.gram.rows, self.gram.columns, len(self.columns)
+        rows, columns, colours = self.schur.rows, self.schur.columns, len(self.columns)
         shared = (self.columns[:, rows] == self.columns[:, columns]) & (self.columns[:, rows] >= 0)
         counts, found = shared.sum(0), []
         for count in np.unique(counts):
@@ -109,23 +109,23 @@ class SparseNormals:
             found.append((of, colours * rows[of] + colour, colours * columns[of] + colour))
         return found
 
-    def least_norm(self, ode: Mechanism, normals: Normals, b: Float[Array, " c"]) -> Float[Array, " c"]:
+    def least_norm(self, ode: Mechanism, jacobian: ConstraintJacobian, b: Float[Array, " c"]) -> Float[Array, " c"]:
         """The only such x: no constraint depends on others."""
-        return self.gram_solve(ode, normals, b)
+        return self.schur_solve(ode, jacobian, b)
 
     @traced_once
-    def lengths(self, ode: Mechanism, normals: Normals) -> Float[Array, " c"]:
+    def lengths(self, ode: Mechanism, jacobian: ConstraintJacobian) -> Float[Array, " c"]:
         """The length of each row of A."""
-        return jnp.sqrt(jnp.sum(self._entries(ode, normals) ** 2, 1))
+        return jnp.sqrt(jnp.sum(self._entries(ode, jacobian) ** 2, 1))
 
     @traced_once
-    def reach(self, ode: Mechanism, normals: Normals, sizes: Float[Array, " n"]) -> Float[Array, " c"]:
+    def reach(self, ode: Mechanism, jacobian: ConstraintJacobian, sizes: Float[Array, " n"]) -> Float[Array, " c"]:
         """|A| s: what changes of that size may move each constraint by."""
-        return jnp.sum(jnp.abs(self._entries(ode, normals)) * sizes[np.maximum(self.columns.T, 0)], 1)
+        return jnp.sum(jnp.abs(self._entries(ode, jacobian)) * sizes[np.maximum(self.columns.T, 0)], 1)
 
-    def _entries(self, ode: Mechanism, normals: Normals) -> Float[Array, "c colours"]:
+    def _entries(self, ode: Mechanism, jacobian: ConstraintJacobian) -> Float[Array, "c colours"]:
         """C of A itself, whatever the masses."""
-        t, q, mass, compressed, *_ = normals
+        t, q, mass, compressed, *_ = jacobian
         if mass is not None and mass.ndim == 3:
             return self._compressed(ode, t, q, jnp.asarray(self.seeds, q.dtype))
         return compressed
@@ -134,29 +134,29 @@ class SparseNormals:
         return 1 / (jnp.broadcast_to(mass, (len(self.seeds),))[np.maximum(self.columns.T, 0)])
 
 
-def sparse_normals(pattern: Bool[np.ndarray, "c n"], block: int = 1) -> SparseNormals | None:
+def sparse_constraint_jacobian(pattern: Bool[np.ndarray, "c n"], block: int = 1) -> SparseConstraintJacobian | None:
     """The sparse form for A with this pattern, where it takes fewer operations than the dense one; `block`: the rows of a block
     of the mass matrix.
     """
     pattern = np.repeat(pattern.reshape(len(pattern), -1, block).any(2), block, 1)
-    found = _sparse_normals(pattern.tobytes(), pattern.shape)
-    return found if found.gram.cost < len(pattern) ** 3 // 3 else None
+    found = _sparse_constraint_jacobian(pattern.tobytes(), pattern.shape)
+    return found if found.schur.cost < len(pattern) ** 3 // 3 else None
 
 
 @functools.lru_cache(maxsize=64)
-def _sparse_normals(pattern: bytes, shape: tuple[int, int]) -> SparseNormals:
+def _sparse_constraint_jacobian(pattern: bytes, shape: tuple[int, int]) -> SparseConstraintJacobian:
     nonzero = np.frombuffer(pattern, bool).reshape(shape)
     colours = column_colouring(nonzero)
     columns = np.full((colours.max() + 1, shape[0]), -1)
     for i, j in np.argwhere(nonzero):
         columns[colours[j], i] = j
     shared = nonzero.astype(np.int32)
-    gram = shared @ shared.T > 0
-    order: Elimination | SparseDefinite = elimination(gram)
+    schur = shared @ shared.T > 0
+    order: Elimination | SparseDefinite = elimination(schur)
     # What would be left to LAPACK.
-    if order.rest_size > LOOPED and SparseDefinite.of(gram).cost < order.cost:
-        order = SparseDefinite.of(gram)
-    return SparseNormals(columns, seed_matrix(colours), order)
+    if order.rest_size > LOOPED and SparseDefinite.of(schur).cost < order.cost:
+        order = SparseDefinite.of(schur)
+    return SparseConstraintJacobian(columns, seed_matrix(colours), order)
 
 
 def _unweighted(factor: Float[Array, "b k k"], seeds: Float[Array, "n colours"]) -> Float[Array, "n colours"]:
