@@ -83,32 +83,23 @@ def _unrolled(s: Float[Array, "m m"], b: Float[Array, "m *k"]) -> Float[Array, "
         unit.append([x * inverse[k] for k, x in enumerate(row)])
         pivot = at_hand[i, i] - _sum(x * y for x, y in zip(row, unit[i], strict=True))
         inverse.append(1 / definite_pivot(pivot, at_hand[i, i], m))
-    return _substituted((lower, unit, inverse), s, b) if m else b
+    if not m:
+        return b
+    # A custom derivative would be forgotten in reverse mode, and the factors stand still in second derivatives.
+    inverted = lambda _, b: _substituted(lower, unit, inverse, b)
+    product = lambda x: jnp.sum(s.reshape(*s.shape, *[1] * (x.ndim - 1)) * x, 1)
+    return lax.custom_linear_solve(product, b, inverted, inverted, symmetric=True)
 
 
-@jax.custom_jvp
 def _substituted(
-    factors: tuple[list[list[Array]], list[list[Array]], list[Array]],
-    s: Float[Array, "m m"],  # noqa: ARG001
-    b: Float[Array, "m *k"],
+    lower: list[list[Array]], unit: list[list[Array]], inverse: list[Array], b: Float[Array, "m *k"]
 ) -> Float[Array, "m *k"]:
-    """x with S x = b, by factors of S: its derivatives are a product with those of S and one more substitution, where those of the
-    elimination would be several times the program.
-    """
-    (lower, unit, inverse), x, m = factors, [], len(b)
+    x, m = [], len(b)
     for i in range(m):
         x.append((b[i] - _sum(lower[i][k] * x[k] for k in range(i))) * inverse[i])
     for i in reversed(range(m)):
         x[i] = x[i] - _sum(unit[k][i] * x[k] for k in range(i + 1, m))
     return jnp.stack(x)
-
-
-@_substituted.defjvp
-def _(primals: Any, tangents: Any) -> Any:
-    (factors, s, b), (_, ds, db) = primals, tangents
-    x = _substituted(factors, s, b)
-    moved = jnp.sum(ds.reshape(*ds.shape, *[1] * (x.ndim - 1)) * x, 1)
-    return x, _substituted(factors, s, db - moved)
 
 
 def _sum(terms: Iterable[Array]):
