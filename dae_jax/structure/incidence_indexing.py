@@ -59,12 +59,16 @@ def gather(eqn: Equation, inputs: list[Cells], sets: Sets) -> list[Cells]:
 
 
 def scatter(eqn: Equation, inputs: list[Cells], sets: Sets) -> list[Cells]:
-    """`operand.at[indices].set(updates)` and its relatives `add`, `multiply`, `min`, `max`."""
+    """`operand.at[indices].set(updates)` and its relatives `add`, `multiply`, `min`, `max`, `apply`."""
     operand, indices, updates = inputs
     numbers = eqn.params["dimension_numbers"]
     inverse, sizes = windows(operand.shape, updates.shape, numbers)
     choices = _gathered(operand.shape, indices, inverse, sizes, eqn.params["mode"])
     selector = _per_window(indices, numbers.update_window_dims, updates.shape, sets)
+    if eqn.primitive.name == "scatter" and eqn.params["update_jaxpr"] is not None:
+        # Of `apply(f)` the updates mean nothing: f takes what is there.
+        before = _read(operand, choices, selector, operand.value.dtype.type(0), sets)
+        updates = Cells(before.dependence, np.zeros_like(before.known), before.value)
     return [_write(operand, updates, choices, selector, SCATTERS[eqn.primitive.name], sets)]
 
 

@@ -171,6 +171,12 @@ class TestLowered:
         assert [reason.primitive for reason in found.unsupported] == ["fft"]
         assert "fft c128[3]" in str(found)
 
+    def test_entries_replaced_by_a_function_of_them(self):
+        # JAX calls it a scatter, whose updates are zeros that mean nothing.
+        fn = lambda x: jax.lax.fori_loop(0, 3, lambda k, y: y.at[jnp.array([0, 2])].apply(jnp.cos) + x, x)
+        assert_same(jit(fn)(X), fn(X))
+        assert [reason.primitive for reason in jit(fn).lower(X).unsupported] == ["scatter"]
+
     def test_prediction_is_what_happens(self, monkeypatch):
         functions = [loop, solved, open_loop, jnp.fft.fft, lambda x: jnp.linalg.svd(jnp.outer(x, x))[1], jnp.sort]
         for fn in functions:

@@ -191,6 +191,12 @@ def test_pattern_contains_that_of_the_jacobian(name):
     assert not (pattern & ~by_value).any()
 
 
+def test_entries_replaced_by_a_function_of_them():
+    """They depend on what was there. JAX has no derivative of it."""
+    (pattern,) = dependence(lambda y: y[::-1].at[jnp.array([0, 2])].apply(jnp.sin), jnp.ones(N))
+    np.testing.assert_array_equal(pattern, np.eye(N)[::-1])
+
+
 @pytest.mark.parametrize("name", [*EXACT, *CONTAINED])
 def test_whatever_moves_depends(name):
     """An output that changes when one input alone is changed is in the pattern of dependence by value."""

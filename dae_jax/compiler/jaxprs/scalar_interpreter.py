@@ -213,6 +213,8 @@ class ScalarInterpreter(Generic[E]):
             return dynamic_slice(eqn, *args)
         if name == "gather":
             return gather(eqn, *args)
+        if name == "scatter" and eqn.params["update_jaxpr"] is not None:
+            raise Unsupported("entries replaced by a function of them are not known")
         combine: Callable[..., Any] = self.total if name == "scatter-add" else lambda _, update: update
         return scatter(eqn, *args, combine=combine)
 

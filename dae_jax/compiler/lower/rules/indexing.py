@@ -8,7 +8,7 @@ import numpy as np
 from ...jaxprs import movement
 from ...jaxprs.gathers import gathered, of_writes, windows
 from ...jaxprs.objects import are_known, as_indices, objects
-from ...types import Params
+from ...types import Equation, Params
 from ..access import load, store
 from ..arithmetic import combined, total
 from ..arrays import Fused, Operand, View, shared
@@ -60,7 +60,12 @@ def _combined(context: Context, before: Number, update: Number) -> Any:
     return combined(context.code, context.name.removeprefix("scatter-"), context.to, before, update)
 
 
-@rule("scatter", (ALL, INTEGERS, ALL), by_memory=True)
+def _without_function(eqn: Equation) -> str | None:
+    """JAX calls `x.at[i].apply(f)` a scatter too, one whose updates mean nothing."""
+    return None if eqn.params["update_jaxpr"] is None else "entries replaced by a function of them are not written"
+
+
+@rule("scatter", (ALL, INTEGERS, ALL), by_memory=True, requires=_without_function)
 def scatter(context: Context, x: Operand, indices: Operand, update: Operand, **_: object) -> Any:
     """An array with entries replaced."""
     return _scattered(context, x, indices, update, _replaced)
