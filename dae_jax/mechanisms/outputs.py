@@ -58,7 +58,10 @@ def _doubt_turns(name: str, ts: Float[Array, "*batch times"], rates: Float[Array
     if isinstance(rates, Tracer) or rates.shape[-1] < 2:
         return
     times, speeds = np.asarray(ts), np.asarray(rates)
-    turns = np.diff(times) * np.stack([speeds[..., :-1], speeds[..., 1:]])
+    # What is saved at steps is filled up with infinite times.
+    with np.errstate(invalid="ignore"):
+        spans = np.where(np.isfinite(times[..., 1:]), np.diff(times), 0)
+    turns = spans * np.stack([speeds[..., :-1], speeds[..., 1:]])
     fast = np.min(np.abs(turns), 0) * (turns[0] * turns[1] > 0)
     if np.any(fast >= np.pi):
         worst = np.unravel_index(np.nanargmax(fast), fast.shape)

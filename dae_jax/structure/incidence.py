@@ -9,6 +9,7 @@ A primitive without a rule is refused: too many dependences would make a structu
 surely as too few make it fail.
 """
 
+import contextlib
 import functools
 import itertools
 import math
@@ -24,7 +25,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Float, PyTree
 from scipy.sparse import csr_array
 
-from ..compiler import ALL_CALLS, called
+from ..compiler import ALL_CALLS, WITH_DERIVATIVE, called
 from ..compiler.types import Aval, Equation, aval_of
 from . import (
     incidence_contractions as contractions,
@@ -93,7 +94,8 @@ def dependence(fn: Callable[..., Any], *example_args: PyTree, derivative: bool =
     `True`.
 
     `derivative=True` leaves out dependences whose derivative is zero wherever it exists: through comparisons, rounding,
-    `sign`, integers, truth values and `stop_gradient`. It gives the pattern of the Jacobian of `fn`.
+    `sign`, integers, truth values and `stop_gradient`. It gives the pattern of the Jacobian of `fn`. What has a derivative of its own
+    (`custom_jvp`, `custom_vjp`) may have one wherever its value depends.
 
     Arrays that `fn` closes over count as constants: a zero among them is a structural zero. Closed over while being
     traced (an argument of an outer `jit`), they count as unknown numbers that depend on nothing.
@@ -178,7 +180,9 @@ def _run_eqn(eqn: Equation, inputs: list[Cells], sets: Sets) -> list[Cells]:
     run = functools.partial(_run, sets=sets)
     inner = called(eqn, CALLS)
     if inner is not None:
-        outputs = run(inner, inputs)
+        # A function with a derivative of its own may have one through what jumps: rounding, a table, a loop that is cut off.
+        with sets.smooth_through_jumps() if name in WITH_DERIVATIVE else contextlib.nullcontext():
+            outputs = run(inner, inputs)
     elif name in CONTROL:
         outputs = CONTROL[name](eqn, inputs, run, sets)
     elif name in MOVES:

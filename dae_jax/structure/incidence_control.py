@@ -74,20 +74,36 @@ def while_loop(eqn: Equation, inputs: list[Cells], run: Run, sets: Sets) -> list
     cond_consts, body_consts, state = inputs[:n_cond], inputs[n_cond : n_cond + n_body], inputs[n_cond + n_body :]
     for _ in range(LONGEST_LOOP):
         goes_on = run(p["cond_jaxpr"], [*cond_consts, *state])[0]
-        if not goes_on.known:
+        if not goes_on.known.all():
             break
-        if not goes_on.value:
+        if not goes_on.value.any():
             return state
-        state = run(p["body_jaxpr"], [*body_consts, *state])
+        after = run(p["body_jaxpr"], [*body_consts, *state])
+        state = [_where(goes_on.value, new, old) for new, old in zip(after, state, strict=True)]
     body = p["body_jaxpr"].jaxpr
     kept = [out is old for out, old in zip(body.outvars, body.invars[n_body:], strict=True)]
 
     def step(state: list[Cells]) -> list[Cells]:
         decided_by = run(p["cond_jaxpr"], [*cond_consts, *state])[0].dependence
         after = run(p["body_jaxpr"], [*body_consts, *state])
-        return [cells if same else cells.also(decided_by, sets) for cells, same in zip(after, kept, strict=True)]
+        return [
+            cells if same else cells.also(_lanes(decided_by, cells), sets)
+            for cells, same in zip(after, kept, strict=True)
+        ]
 
     return _repeat(step, state, sets)
+
+
+def _lanes(x: np.ndarray, like: Cells) -> np.ndarray:
+    """What there is one of for each lane of a batch, along the first axes of what all lanes have."""
+    return x.reshape(x.shape + (1,) * (like.dependence.ndim - x.ndim))
+
+
+def _where(goes_on: np.ndarray, after: Cells, before: Cells) -> Cells:
+    """In a batch each lane has a condition of its own, and stays as it is where that is false."""
+    mask = _lanes(goes_on, after)
+    parts = ((after.dependence, before.dependence), (after.known, before.known), (after.value, before.value))
+    return Cells(*(np.where(mask, new, old) for new, old in parts))
 
 
 def _repeat(step: Callable[[list[Cells]], list[Cells]], state: list[Cells], sets: Sets) -> list[Cells]:

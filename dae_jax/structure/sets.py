@@ -6,7 +6,9 @@ sets; the converse does not hold, for which there is `Sets.equal`.
 Source: J.-C. Filliâtre, S. Conchon, Type-safe modular hash-consing, Workshop on ML (2006).
 """
 
+import contextlib
 from array import array
+from collections.abc import Iterator
 
 import numpy as np
 from jaxtyping import Int
@@ -33,7 +35,7 @@ class Sets:
     """
 
     def __init__(self, n: int, slopes_only: bool = False) -> None:
-        self.slopes_only = slopes_only
+        self.slopes_only, self._smooth = slopes_only, False
         self.left, self.right, self.level = array("q"), array("q"), array("q")
         self._known: dict[int, int] = {}
         self._runs: list[tuple[np.ndarray, np.ndarray]] = []
@@ -63,8 +65,19 @@ class Sets:
             high[both] = self._looked_up(low[both] << 32 | high[both])
         return high
 
+    @contextlib.contextmanager
+    def smooth_through_jumps(self) -> Iterator[None]:
+        """Jumps are none meanwhile."""
+        before, self._smooth = self._smooth, True
+        try:
+            yield
+        finally:
+            self._smooth = before
+
     def through_jump(self, a: Ids) -> Ids:
         """The same elements, all of them reached through a jump."""
+        if self._smooth:
+            return a
         if self.slopes_only or not a.any():
             return np.zeros_like(a)
         if a.size < FEW:

@@ -149,3 +149,12 @@ def test_derivatives_go_through_what_is_assembled(through):
     assert found["length"] == pytest.approx((1 + rate) * np.cos(angle), rel=1e-9)
     assert found["angle"] == pytest.approx(-(1 + rate) * length * np.sin(angle), rel=1e-9)
     assert found["rate"] == pytest.approx(length * np.cos(angle), rel=1e-9)
+
+
+def test_what_fills_up_the_steps_is_no_turn():
+    mechanism = m.Mechanism([ROD], [HINGE])
+    y0 = mechanism.assemble(rates={"hinge": -5.0})
+    save = diffrax.SaveAt(t0=True, steps=True)
+    sol = dae_jax.daesolve(mechanism.system(), SOLVER, 0.0, 0.5, 0.1, y0, saveat=save)
+    angle = mechanism.coordinate(sol, "hinge")[np.isfinite(sol.ts)]
+    np.testing.assert_allclose(angle, np.linspace(0, -2.5, 6), rtol=1e-3)

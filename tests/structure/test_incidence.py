@@ -34,6 +34,14 @@ def tripled(x):
 tripled.defvjp(lambda x: (tripled(x), None), lambda _, ct: (3 * ct,))
 
 
+@jax.custom_jvp
+def rounded(x):
+    return jnp.round(2.0**40 * x) / 2.0**40
+
+
+rounded.defjvp(lambda primals, tangents: (rounded(*primals), tangents[0]))
+
+
 def rotation(angle):
     c, s = jnp.cos(angle), jnp.sin(angle)
     return jnp.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -119,6 +127,10 @@ EXACT = {
     "map": lambda y: lax.map(lambda x: x**2, y),
     "associative scan": lambda y: lax.associative_scan(jnp.add, y),
     "custom jvp": doubled,
+    "custom jvp of what jumps": lambda y: rounded(y[::-1]) + jnp.round(y),
+    "vmapped while": lambda y: jax.vmap(
+        lambda x, n: lax.while_loop(lambda s: s[1] < n, lambda s: (s[0] * x, s[1] + 1), (1.0, 0))[0]
+    )(y, jnp.arange(N)),
     "remat": jax.checkpoint(lambda y: jnp.sin(y[::-1])),
     "relu": jax.nn.softplus,
     "clamp": lambda y: jnp.clip(y, -100 * y[0] ** 2, 100 * y[1] ** 2 + 1) + y[0] * y[1],
@@ -157,6 +169,7 @@ CONTAINED = {
     "scatter": lambda y: y.at[jnp.argmax(y)].set(y[0]),
     "interpolation": lambda y: jnp.interp(y, np.linspace(-2, 2, 9), np.linspace(-2, 2, 9) ** 2),
     "while": open_loop,
+    "vmapped while": lambda y: jax.vmap(lambda x: lax.while_loop(lambda s: s < 9, lambda s: 2 * s + x**2 + 1, x))(y),
     "branches": lambda y: lax.cond(y[0] > 0, lambda a: a[:3], lambda a: a[3:], y),
     "where": lambda y: jnp.where(y > 0, y, y[::-1]),
     "pseudo-inverse": lambda y: jnp.linalg.pinv(y.reshape(2, 3)),
