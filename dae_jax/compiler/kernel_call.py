@@ -45,13 +45,19 @@ class Decision:
 
 
 def decision(jaxpr: ClosedJaxpr, batched: Sequence[bool] = ()) -> Decision:
-    """Who compiles a function on JAX's default device; `batched`: of a batch, in which these arguments have a leading axis."""
+    """Who compiles a function on JAX's default device, and all that our compiler does not take of it; `batched`: of a batch, in which
+    these arguments have a leading axis.
+    """
     try:
         kernel, used = _needed(jaxpr)
     except Unsupported as reason:
         return Decision("xla", (reason,))
     kept = tuple(b for b, u in zip(batched, used, strict=True) if u) if batched else ()
-    return _decided(kernel, kept, jax.default_backend() == "gpu")
+    on_gpu = jax.default_backend() == "gpu"
+    found = _decided(kernel, kept, on_gpu)
+    if not found.unsupported or current().compiler != "llvm" or (on_gpu and gpu() is None):
+        return found
+    return dataclasses.replace(found, unsupported=lower.unsupported(kernel, kept, gpu() if on_gpu else None))
 
 
 def unsupported(jaxpr: ClosedJaxpr) -> tuple[str, ...]:
@@ -72,9 +78,10 @@ def _decided(kernel: ClosedJaxpr, batched: tuple[bool, ...], on_gpu: bool = Fals
     elif on_gpu and gpu() is None:
         found = (Unsupported("there is no GPU that kernels work on", primitive="system"),)
     else:
-        found = lower.unsupported(kernel, batched, gpu() if on_gpu else None)
-    if not found:
-        return Decision("llvm", ())
+        judged = lower.annotate(kernel, batched, gpu() if on_gpu else None)
+        if not isinstance(judged, Unsupported):
+            return Decision("llvm", ())
+        found = (judged,)
     # XLA's single kernels are the CPU's; which form of a batch it takes depends on its size.
     by_xla = not on_gpu and current().compiler != "off" and not xla_kernel.unsupported(kernel)
     return Decision("xla kernel" if by_xla else "xla", found)

@@ -28,6 +28,7 @@ from ..types import BoolScalar, Time, Y
 from .between_steps import Flow, StillSteps, along_flow, beside, has_flow, held, jump_times
 from .bracket import bracketing
 from .crossings import OneCrossing, OnStates
+from .event_adjoint import conditions_of
 from .event_functions import known_to_conditions
 from .felt_steps import SMALL, OneDirection, felt_steps
 from .followed_formulas import KnownFormulas
@@ -121,8 +122,7 @@ def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[
     saveat = eqx.tree_at(lambda s: s.subs, solve.saveat, subs, is_leaf=lambda x: x is None)
     if event is not None:
         direction, given = jnp.where(t1 < t0, -1, 1), known_to_conditions(solve, problem)
-        on_states = lambda c, up: OnStates(c, decode, args, direction, up, given)
-        conditions = jax.tree.map(on_states, event.cond_fn, event.direction, is_leaf=lambda x: x is None or callable(x))
+        conditions = conditions_of(event, decode, args, direction, given)
         event = dataclasses.replace(event, cond_fn=conditions, root_finder=bracketing(event.root_finder))
     sums_errors = _may_ignore_errors(solve.controller) and not solve.recording
     observers: dict[str, Observer] = {"errors": SummedErrors()} if sums_errors else {}

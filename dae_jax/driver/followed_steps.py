@@ -44,11 +44,21 @@ class RecordedEnds(eqx.Module):
         return Ends(before.count + step.kept, times)
 
 
+class Stop(NamedTuple):
+    """The time at which a solve with events ended, and the number of the event that ended it, −1 for none."""
+
+    time: Float[Array, ""] | Int[Array, ""]
+    event: Int[Array, ""]
+
+
 class Steps(NamedTuple):
-    """Steps to take: the times at their ends, that of the start first, then infinity; and their formulas, where a solver has several."""
+    """Steps to take: the times at their ends, that of the start first, then infinity; their formulas, where a solver has several; and
+    where the solution stopped, where it has events.
+    """
 
     times: Float[Array, " ends"] | Int[Array, " ends"]
     formulas: Int8[Array, " steps"] | None
+    stop: Stop | None = None
 
 
 def taken(ends: Ends, formulas: Int8[Array, " steps"] | None) -> Steps:
@@ -58,14 +68,18 @@ def taken(ends: Ends, formulas: Int8[Array, " steps"] | None) -> Steps:
 
 def as_bits(steps: Steps) -> Steps:
     """The times as integers, which have no derivative."""
-    kind = jnp.int64 if steps.times.dtype == jnp.float64 else jnp.int32
-    return steps._replace(times=lax.bitcast_convert_type(steps.times, kind))
+    return _converted(steps, jnp.int64 if steps.times.dtype == jnp.float64 else jnp.int32)
 
 
 def of_bits(steps: Steps) -> Steps:
     """The times as numbers again."""
-    kind = jnp.float64 if steps.times.dtype == jnp.int64 else jnp.float32
-    return steps._replace(times=lax.bitcast_convert_type(steps.times, kind))
+    return _converted(steps, jnp.float64 if steps.times.dtype == jnp.int64 else jnp.float32)
+
+
+def _converted(steps: Steps, kind: Any) -> Steps:
+    converted = lambda times: lax.bitcast_convert_type(times, kind)
+    stop = None if steps.stop is None else steps.stop._replace(time=converted(steps.stop.time))
+    return steps._replace(times=converted(steps.times), stop=stop)
 
 
 def reach(steps: Steps) -> BoolScalar:

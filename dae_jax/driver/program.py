@@ -10,10 +10,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
-from jaxtyping import PyTree
 
 from .._compat import is_captured, lacks_reverse_derivatives
-from ..compiler import Moving, PullBack, inexact, one_kernel, one_kernel_enabled, trace_state_clean, waiting
+from ..compiler import PullBack, inexact, one_kernel, one_kernel_enabled, trace_state_clean, waiting
 from ..compiler.kernel_call import as_kernel
 from ..compiler.types import Arrays
 from ..equations.independent import independent
@@ -21,26 +20,28 @@ from ..equations.regularity import COARSE
 from ..equations.residual_form import LARGE
 from ..formulations import AbstractFormulation
 from ..solution import DAESolution, Split
-from ..solvers import AbstractManifoldSolver, economical, replays, takes_residuals
+from ..solvers import AbstractManifoldSolver, takes_residuals
 from ..types import BoolScalar, Scalar, State, Y
 from ..validate.captured import settled
 from ..validate.user_functions import refuse_wrong_functions, returned
-from .between_steps import Flow, has_flow, held
+from .between_steps import Flow, has_flow
 from .changes import changing, some_changes, with_changes
-from .diffrax_call import Decode, View, call, failed, steps_of, took_steps
+from .diffrax_call import call, failed, steps_of, took_steps
 from .ends import Start, look
+from .event_adjoint import stop_of
 from .event_functions import known_to_conditions, refuse_wrong_event
 from .failures import refused_on_the_way
 from .felt_steps import OneDirection, by_felt_steps
 from .followed_steps import Steps, as_bits, if_reached, of_bits
 from .outcome import judged
 from .problem import Problem, Program, split
+from .pull_back import by_trajectory
 from .reached import with_derivatives, without_stop
 from .resets import Reset, solve_with_resets
 from .start import saved_parts
 from .switches import warn_of_moving_switches
 from .tolerances import span_of
-from .trajectory_adjoint import StepInputs, as_it_is, cotangents, has_trajectory_adjoint, recorded, saved_times
+from .trajectory_adjoint import as_it_is, has_trajectory_adjoint
 
 
 FORWARD_ONLY = (
@@ -221,48 +222,16 @@ class Solve:
         if self.derivative() == "forward":
             return _refuse_reverse
         size = sum(leaf.size for leaf in jax.tree.leaves(problem.y0))
-        fixed_steps = isinstance(self.controller, diffrax.ConstantStepSize)
         if self.derivative() != "reverse" or not has_trajectory_adjoint(self, size):
             return None
-        program, _ = split((self, problem))
-
-        def pull_back(inputs: tuple[Arrays], cotangent: Split, moving: Moving) -> list[Any]:
-            with settled(program.leaves):
-                arrays, *steps = inputs
-                solve, problem = program.whole(arrays)
-                recording = dataclasses.replace(
-                    solve.forwards(), saveat=recorded(replays(solve.solver)), recording=True
-                )
-                record, also_arrays = recording.kernel(problem)
-                again = record(also_arrays, *steps).whole()
-                _, _, ts, ys, interpolation, *_ = again
-                # The flags of steps come after those of the arrays.
-                numbers, others = eqx.partition(arrays, list(moving[: len(arrays)]))
-                fixed: list[Any] = []
-
-                def encoded(numbers: PyTree) -> Any:
-                    solve, problem = program.whole(eqx.combine(numbers, others))
-                    found, fixed[:] = solve._step_inputs(problem).moving_apart(others)
-                    return found
-
-                found, through_encoding = jax.vjp(encoded, numbers)
-                of_t0, of_t1, of_ts, of_ys, _, of_stats, *_ = cotangent.numbers
-                of_t1 = of_t1 + of_stats["end_time"]
-                trajectory = ts, ys, None if interpolation is None else interpolation.path.infos
-                of_inputs = cotangents(found, StepInputs(*fixed), fixed_steps, trajectory, of_ys)
-                (of_arrays,) = through_encoding(saved_times(of_inputs, self.saveat.subs, of_t0, of_t1, of_ts))
-                return inexact(if_reached(of_arrays, of_bits(*steps) if steps else None, took_steps(again)))
-
-        return pull_back
+        return by_trajectory(split((self, problem))[0])
 
     def _felt_steps(self, problem: Problem) -> Callable[..., Steps] | None:
         """The steps of derivatives, which are the same for all of them: in the sum of a second derivative's parts, what leads off
         the manifold cancels only if these have the same steps.
         """
-        adaptive = isinstance(self.controller, diffrax.AbstractAdaptiveStepSizeController)
-        size = sum(leaf.size for leaf in jax.tree.leaves(problem.y0))
         most = self.max_steps
-        if not (adaptive and self.has_derivative_apart()) or most is None or size > LARGE:
+        if most is None or not self.has_steps_of_derivatives(sum(leaf.size for leaf in jax.tree.leaves(problem.y0))):
             return None
         saveat = diffrax.SaveAt(subs=diffrax.SubSaveAt(t1=True, fn=as_it_is))
         program, _ = split((self, problem))
@@ -288,19 +257,11 @@ class Solve:
             problem = program.whole(arrays)[1]
             changes = as_kernel(changes_of, often=False)(arrays, end)
             found = as_kernel(steps)(arrays, changes, failed(out, problem))
+            if self.event is not None:
+                found = as_bits(of_bits(found)._replace(stop=stop_of(jax.lax.stop_gradient(out.whole()))))
             return refused_on_the_way(found, most) if self.throw else found
 
         return way
-
-    def _step_inputs(self, problem: Problem) -> StepInputs:
-        y, ode = self.encoded(problem)
-        part = self.saveat.subs
-        solver, flow, still = economical(self.solver, self.between()), self.flow(), self.is_still(y)
-        # An interval without length has no derivatives by its times.
-        start = jnp.where(problem.t0 == problem.t1, jax.lax.stop_gradient(problem.t0), problem.t0)
-        y = held(y, start, flow, ode) if still else y
-        view = View(part.fn, Decode(flow, self.solver, still), problem.args)
-        return StepInputs(self.formulation, solver, part, problem.t0, problem.t1, problem.dt0, y, ode, view)
 
     def flow(self) -> Flow:
         """Where points move with their time: the time of an event is that where a condition is zero, whose derivative by others, at that
@@ -334,6 +295,11 @@ class Solve:
         """Whether the derivative is a program of its own."""
         in_its_own_steps = self.derivative() == "any" or isinstance(self.adjoint, OneDirection)
         return not in_its_own_steps and one_kernel_enabled() and not self.recording
+
+    def has_steps_of_derivatives(self, size: int) -> bool:
+        """Whether derivatives, with `size` unknowns, have steps of their own."""
+        adaptive = isinstance(self.controller, diffrax.AbstractAdaptiveStepSizeController)
+        return adaptive and self.has_derivative_apart() and self.max_steps is not None and size <= LARGE
 
     def records_steps(self) -> bool:
         """Whether the steps are written down for the derivative."""

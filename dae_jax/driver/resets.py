@@ -16,7 +16,7 @@ from .._compat import while_loop
 from ..compiler import one_kernel
 from ..compiler.types import Arrays
 from ..consistent import consistent_after
-from ..solution import RESULTS, DAESolution, Split, precision_of
+from ..solution import RESULTS, DAESolution, Split, last_saved, precision_of
 from ..systems import System
 from ..types import Args, BoolScalar, Scalar, State, Time
 from ..validate.states import NUMBERS, brief
@@ -168,18 +168,21 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Start]
         )
         # No maximum, whose derivative is shared out between equal numbers.
         later = jnp.where(sign * wanted < sign * p.t, p.t, wanted)
-        subs = {"wanted": dataclasses.replace(output, t0=False, t1=False, ts=later), "end": diffrax.SubSaveAt(t1=True)}
-        one = dataclasses.replace(solve, event=event, saveat=diffrax.SaveAt(subs=subs))
+        both = dataclasses.replace(output, t0=False, t1=True, ts=later, fn=_WithState(output.fn))
+        one = dataclasses.replace(solve, event=event, saveat=diffrax.SaveAt(subs=both))
         sol, _ = one(dataclasses.replace(problem, t0=p.t, y0=p.y, args=args))
         return dataclasses.replace(sol, given=None), side
 
     def advance(p: _Progress) -> _Progress:
         sol, side = part(p)
-        end, reached = sol.ts["end"][-1], jax.tree.map(lambda y: y[-1], sol.ys["end"])
+        saved, states = sol.ys
+        # That of the end comes after those of the times that were reached.
+        row = last_saved(sol.ts)
+        end, reached = sol.ts[row], jax.tree.map(lambda y: y[row], states)
         here = (sign * wanted >= sign * p.t) & (sign * wanted <= sign * end)
         ts = jnp.where(here, wanted, p.ts)
         choose = lambda a, b: jnp.where(here.reshape(-1, *(1,) * (b.ndim - 1)), a, b)
-        ys = jax.tree.map(choose, sol.ys["wanted"], p.ys)
+        ys = jax.tree.map(lambda new, old: choose(new[:-1], old), saved, p.ys)
         changed = list(map(choose, jax.tree.leaves(eqx.filter(p.args, changes)), p.changed))
         stats = {k: p.stats[k] + v for k, v in sol.stats.items() if k not in NO_COUNTS}
         stats["doubts"] = p.stats["doubts"] | sol.stats["doubts"]
@@ -204,7 +207,7 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Start]
     shape = jax.eval_shape(
         part, _Progress(t0, y0, numbers, none, none, none, none, none, none, none, unknown, unknown, unknown, unknown)
     )[0]
-    unsaved = jax.tree.map(lambda x: jnp.full(x.shape, jnp.inf, x.dtype), shape.ys["wanted"])
+    unsaved = jax.tree.map(lambda x: jnp.full((x.shape[0] - 1, *x.shape[1:]), jnp.inf, x.dtype), shape.ys[0])
     stats = {k: jnp.zeros((), int) for k in shape.stats if k not in NO_COUNTS}
     over_times = lambda x: jnp.broadcast_to(x, (*wanted.shape, *jnp.shape(x)))
     given = list(map(over_times, jax.tree.leaves(eqx.filter(numbers, changes))))
@@ -232,6 +235,15 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Start]
     )
     fine = ~jnp.any(jnp.stack([p.code == code._value for code in refused]))
     return sol, Start(jnp.where(fine, 0, 1), fine)
+
+
+class _WithState(eqx.Module):
+    """What is saved of a state, and that."""
+
+    fn: Callable[..., Any]
+
+    def __call__(self, t: Time, y: State, args: Args) -> Any:
+        return self.fn(t, y, args), y
 
 
 def _differs(condition: Callable[..., Any], t: Time, y: State, args: Args, rtol: State, atol: State) -> BoolScalar:

@@ -21,6 +21,9 @@ from .._compat import WrapTerm
 from ..equations.residual_form import LARGE
 from ..solvers import is_recomputable, replays
 from ..types import IntScalar, Scalar, Time, Y
+from .crossings import OnStates
+from .event_adjoint import at_event
+from .followed_steps import Stop
 from .start import is_saved_part
 
 
@@ -42,7 +45,7 @@ def has_trajectory_adjoint(solve: "Solve", size: int) -> bool:
     return (
         is_saved_part(part)
         and not (part.steps or saveat.dense or saveat.solver_state or saveat.controller_state or saveat.made_jump)
-        and solve.event is None
+        and (solve.event is None or solve.has_steps_of_derivatives(size))
         and type(solve.controller) in (diffrax.PIDController, diffrax.ConstantStepSize)
         and solve.max_steps is not None
         and numbers * size <= largest
@@ -71,6 +74,8 @@ class StepInputs(NamedTuple):
     y: Any
     ode: Any
     view: Any
+    # Of events.
+    conditions: Any
 
     def moving_apart(self, still: PyTree[Array]) -> tuple["StepInputs", "StepInputs"]:
         """What has cotangents and the rest, where these arrays are `still`: what is none of them, and in any case the state."""
@@ -87,7 +92,9 @@ def cotangents(
     rest: StepInputs,
     fixed_steps: bool,
     trajectory: tuple[Float[Array, " steps"], Y, PyTree[Array]],
-    wanted: PyTree[Array],
+    wanted: tuple[Float[Array, " times"], PyTree[Array]],
+    of_end: Scalar,
+    stop: Stop | None,
 ) -> StepInputs:
     """The cotangents of what moves.
 
@@ -98,16 +105,20 @@ def cotangents(
       sizes of their own but the last.
     - `trajectory`: times and points of the accepted steps, the start first, and for a solver that replays them what is between;
       times that are not finite are padding.
-    - `wanted`: the cotangents of the saved values, a leading axis of times.
+    - `wanted`: the cotangents of the saved times and values, a leading axis of times; `of_end`: that of the time at the end.
+    - `stop`: where the solution ended, and by which event, where it has events: the end is t1 here, which follows from all else.
     """
     times, points, between = trajectory
+    of_saved_times, wanted = wanted
     inputs = eqx.combine(numbers, rest)
     part = inputs.part
     save_times = jnp.zeros(0, times.dtype) if part.ts is None else part.ts
     first = int(part.t0)
     direction = jnp.where(inputs.t1 < inputs.t0, -1, 1)
     last = jnp.sum(jnp.isfinite(times)) - 1
-    last_saved, end = _last_needed(direction, times, save_times, wanted, first)
+    # What is saved of the end comes after the times that it was reached by.
+    reached = save_times.size if stop is None else jnp.sum(direction * (save_times - stop.time) <= 0)
+    first_saved, last_saved, end = _needed(direction, times, save_times, wanted, first, reached)
     end = jnp.minimum(end, last - 1)
     still = inputs.view.decode.still
     times_move = jax.tree.leaves((numbers.t0, numbers.t1, numbers.dt0, numbers.part.ts))
@@ -118,6 +129,11 @@ def cotangents(
     def saved(numbers: PyTree, t: Time, y: Y) -> Any:
         all_of = eqx.combine(numbers, rest)
         return all_of.view(of_flow(t), y, all_of.ode)
+
+    def values(numbers: PyTree, t: Time, y: Y) -> list[Any]:
+        all_of = eqx.combine(numbers, rest)
+        conditions = jax.tree.leaves(all_of.conditions, is_leaf=lambda x: isinstance(x, OnStates))
+        return [condition(direction * t, y, all_of.ode) for condition in conditions]
 
     def parts(numbers: PyTree) -> tuple[Any, Any, Any]:
         all_of = eqx.combine(numbers, rest)
@@ -155,7 +171,7 @@ def cotangents(
 
         def more(carry: tuple[PyTree, ...]) -> Any:
             j = carry[0]
-            return (j >= 0) & ((direction * (save_times[j] - a) > 0) | (k == 0))
+            return (j >= first_saved) & ((direction * (save_times[j] - a) > 0) | (k == 0))
 
         def pull(carry: tuple[PyTree, ...]) -> Any:
             j, of_numbers, of_dense, of_a, of_b, of_times = carry
@@ -205,11 +221,17 @@ def cotangents(
         return k - 1, j, of_y, of_history, of_numbers, of_t0 + a0 + b0, of_t1 + a1 + b1, of_times
 
     of_y, of_numbers, zero = _zeros(_entry(points, 0)), _zeros(numbers), jnp.zeros_like(inputs.t0)
-    of_t1 = zero
+    of_t1, row = of_end, first + reached
     if part.t1:
+        of_last = _entry(wanted, row)
         _, pull_back = jax.vjp(saved, numbers, inputs.t1, _entry(points, last))
-        of_numbers, of_t1, of_y = pull_back(_entry(wanted, -1))
-        end = jnp.where(_is_zero(_entry(wanted, -1)), end, last - 1)
+        of_numbers, more_t1, of_y = pull_back(of_last)
+        of_t1 = of_t1 + more_t1 + of_saved_times[row]
+        end = jnp.where(_is_zero(of_last), end, last - 1)
+    if stop is not None:
+        end = jnp.where(of_t1 == 0, end, last - 1)
+        more_numbers, of_t1, more_y = at_event(stop.event, values, numbers, inputs.t1, _entry(points, last), of_t1)
+        of_numbers, of_y = _sum(of_numbers, more_numbers), _sum(of_y, more_y)
     carry = (end, last_saved, of_y, _zeros(begin), of_numbers, zero, of_t1, jnp.zeros_like(save_times))
     _, _, of_y, of_begin, of_numbers, of_t0, of_t1, of_times = lax.while_loop(
         lambda carry: carry[0] >= 0, one_step, carry
@@ -217,47 +239,44 @@ def cotangents(
     of_numbers = _sum(of_numbers, begins(of_begin)[0])
     if first or save_times.size:
         _, pull_back = jax.vjp(saved, numbers, inputs.t0, inputs.y)
-        more_numbers, more_t0, more_y = pull_back(_of_start(wanted, first, jnp.where(last > 0, 0, save_times.size)))
+        more_numbers, more_t0, more_y = pull_back(_of_start(wanted, first, jnp.where(last > 0, 0, reached)))
         of_numbers, of_t0, of_y = _sum(of_numbers, more_numbers), of_t0 + more_t0, _sum(of_y, more_y)
     of_numbers = of_numbers._replace(y=_sum(of_numbers.y, of_y))
-    return _with_times(of_numbers, of_t0, of_t1, of_times)
+    of_t0 = of_t0 + (of_saved_times[0] if first else 0)
+    counts = jnp.arange(save_times.size) < reached
+    return with_times(
+        of_numbers, of_t0, of_t1, of_times + jnp.where(counts, of_saved_times[first : first + save_times.size], 0)
+    )
 
 
-def saved_times(
-    of_inputs: StepInputs, part: diffrax.SubSaveAt, of_t0: Scalar, of_t1: Scalar, of_ts: Float[Array, " times"]
-) -> StepInputs:
-    """`cotangents` with those of the times that a solution holds: its t0, t1, and the ts that `part` asks for."""
-    first = int(part.t0)
-    of_times = None if part.ts is None else of_ts[first : first + part.ts.size]
-    return _with_times(of_inputs, of_t0 + (of_ts[0] if part.t0 else 0), of_t1 + (of_ts[-1] if part.t1 else 0), of_times)
-
-
-def _with_times(of_inputs: StepInputs, of_t0: Scalar, of_t1: Scalar, of_times: Array | None) -> StepInputs:
+def with_times(of_inputs: StepInputs, of_t0: Scalar, of_t1: Scalar | None, of_times: Array | None) -> StepInputs:
     """`of_inputs` and what else its times have."""
     found = of_inputs._replace(t0=_plus(of_inputs.t0, of_t0), t1=_plus(of_inputs.t1, of_t1))
-    if of_inputs.part.ts is None:
+    if of_inputs.part.ts is None or of_times is None:
         return found
     return eqx.tree_at(lambda found: found.part.ts, found, of_inputs.part.ts + of_times)
 
 
 def _plus(cotangent: Any, more: Any) -> Any:
     """The sum; `None` where there is no cotangent of what does not move."""
-    return None if cotangent is None else cotangent + more
+    return cotangent if cotangent is None or more is None else cotangent + more
 
 
-def _last_needed(
-    direction: IntScalar, times: Array, save_times: Array, wanted: PyTree[Array], first: int
-) -> tuple[IntScalar, IntScalar]:
-    """The last saved time whose cotangent is not 0, and the step that it is in; −1: none. What comes after it is left out: where a
-    solve fails it may have no derivative.
+def _needed(
+    direction: IntScalar, times: Array, save_times: Array, wanted: PyTree[Array], first: int, reached: IntScalar | int
+) -> tuple[IntScalar, IntScalar, IntScalar]:
+    """The first and the last saved time that was reached and whose cotangent is not 0, and the step that the last is in; −1: none. What
+    comes after it is left out: where a solve fails it may have no derivative.
     """
     none = jnp.asarray(-1)
     if not save_times.size:
-        return none, none
-    counts = ~jax.vmap(lambda j: _is_zero(_entry(wanted, first + j)))(jnp.arange(save_times.size))
-    last_saved = jnp.max(jnp.where(counts, jnp.arange(save_times.size), -1))
+        return none, none, none
+    numbers = jnp.arange(save_times.size)
+    counts = ~jax.vmap(lambda j: _is_zero(_entry(wanted, first + j)))(numbers) & (numbers < reached)
+    first_saved = jnp.min(jnp.where(counts, numbers, save_times.size))
+    last_saved = jnp.max(jnp.where(counts, numbers, -1))
     before = jnp.sum(jnp.isfinite(times) & (direction * (times - save_times[last_saved]) < 0)) - 1
-    return last_saved, jnp.where(last_saved < 0, -1, jnp.maximum(before, 0))
+    return first_saved, last_saved, jnp.where(last_saved < 0, -1, jnp.maximum(before, 0))
 
 
 def _of_start(wanted: PyTree[Array], first: int, times: IntScalar) -> PyTree[Array]:

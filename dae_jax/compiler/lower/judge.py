@@ -13,7 +13,7 @@ from ..jaxprs.equal_functions import EqualFunctions
 from ..jaxprs.inline import Inlining
 from ..jaxprs.random_keys import without_keys
 from ..jaxprs.scalar_interpreter import Unsupported
-from ..jaxprs.walk import closed_in
+from ..jaxprs.walk import closed_in, equations
 from ..thresholds import THRESHOLDS
 from ..types import Equation
 from . import estimate, rules as rules
@@ -51,12 +51,25 @@ def unsupported(
 @functools.lru_cache(maxsize=4)
 def _annotated(jaxpr: ClosedJaxpr, batched: tuple[bool, ...], target: Target) -> Annotated | Unsupported:
     whole, procedures = without_keys(jaxpr), frozenset()
+    refused = _callback(whole, target)
+    if refused is not None:
+        return refused
     if not target.threads and is_large(whole):
         whole = EqualFunctions()(whole)
         procedures = repeated(whole)
     inlined = Inlining(procedures)
     found = next(_unsupported(inlined(whole), inlined, target), None)
     return found or _unless_too_large(estimate.annotated(inlined(whole), batched, inlined, target))
+
+
+def _callback(jaxpr: ClosedJaxpr, target: Target) -> Unsupported | None:
+    """A function of the user's, or one that raises, which is not compiled: found before a program, which may be large, is looked into."""
+    for eqn in equations(jaxpr):
+        if eqn.primitive.name == "pure_callback":
+            reason = _reason(eqn, target)
+            if reason:
+                return Unsupported(reason, quoted(eqn), eqn.primitive.name)
+    return None
 
 
 def _unsupported(jaxpr: ClosedJaxpr, inlined: Inlining, target: Target | None) -> Iterator[Unsupported]:
