@@ -1,7 +1,7 @@
 """The reverse derivative of a solve by its trajectory, as a function of the solve's arrays."""
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -12,20 +12,15 @@ from jaxtyping import PyTree
 from ..compiler import Moving, PullBack, inexact
 from ..compiler.types import Arrays
 from ..solution import Split
-from ..solvers import economical, replays
+from ..solvers import replays
 from ..types import Scalar
 from ..validate.captured import settled
-from .between_steps import held
-from .diffrax_call import Decode, View, took_steps
-from .event_adjoint import conditions_of, end_of, up_to
-from .event_functions import known_to_conditions
+from .diffrax_call import took_steps
+from .event_adjoint import end_of, up_to
 from .followed_steps import Stop, as_bits, if_reached, of_bits
-from .problem import Problem, Program
-from .trajectory_adjoint import StepInputs, cotangents, recorded, with_times
-
-
-if TYPE_CHECKING:
-    from .program import Solve
+from .problem import Program
+from .step_inputs import StepInputs
+from .trajectory_adjoint import cotangents, recorded, with_times
 
 
 def by_trajectory(program: Program) -> PullBack:
@@ -55,7 +50,7 @@ def by_trajectory(program: Program) -> PullBack:
 
             def encoded(numbers: PyTree) -> tuple[Any, Scalar]:
                 solve, problem = program.whole(eqx.combine(numbers, others))
-                found, fixed[:] = _step_inputs(solve, problem, stop).moving_apart(others)
+                found, fixed[:] = StepInputs.of(solve, problem, stop).moving_apart(others)
                 return found, problem.t1
 
             (found, _), through_encoding = jax.vjp(encoded, numbers)
@@ -69,19 +64,3 @@ def by_trajectory(program: Program) -> PullBack:
             return inexact(if_reached(of_arrays, of_bits(*steps) if steps else None, took_steps(again)))
 
     return pull_back
-
-
-def _step_inputs(solve: "Solve", problem: Problem, stop: Stop | None) -> StepInputs:
-    y, ode = solve.encoded(problem)
-    part, t0, t1 = solve.saveat.subs, problem.t0, problem.t1
-    solver, flow, still = economical(solve.solver, solve.between()), solve.flow(), solve.is_still(y)
-    # An interval without length has no derivatives by its times.
-    start = jnp.where(t0 == t1, jax.lax.stop_gradient(t0), t0)
-    y = held(y, start, flow, ode) if still else y
-    decode, conditions = Decode(flow, solve.solver, still), None
-    if stop is not None:
-        direction, given = jnp.where(t1 < t0, -1, 1), known_to_conditions(solve, problem)
-        conditions = conditions_of(solve.event, decode, problem.args, direction, given)
-        t1 = jnp.where(stop.event >= 0, stop.time, t1)
-    view = View(part.fn, decode, problem.args)
-    return StepInputs(solve.formulation, solver, part, t0, t1, problem.dt0, y, ode, view, conditions)

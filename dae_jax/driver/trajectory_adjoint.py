@@ -8,7 +8,7 @@ for solvers whose step is a function of its start, or that can `replay` it: of i
 step costs its derivative alone.
 """
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import diffrax
 import equinox as eqx
@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._compat import WrapTerm
 from ..equations.residual_form import LARGE
+from ..formulations import AbstractFieldFormulation
 from ..solvers import is_recomputable, replays
 from ..types import IntScalar, Scalar, Time, Y
 from .crossings import OnStates
@@ -29,6 +30,7 @@ from .start import is_saved_part
 
 if TYPE_CHECKING:
     from .program import Solve
+    from .step_inputs import StepInputs
 
 
 # Numbers of a trajectory, at most, of points, and of a large system, whose steps take longer than to lay out the trajectory, in all; beyond
@@ -45,12 +47,17 @@ def has_trajectory_adjoint(solve: "Solve", size: int) -> bool:
     return (
         is_saved_part(part)
         and not (part.steps or saveat.dense or saveat.solver_state or saveat.controller_state or saveat.made_jump)
-        and (solve.event is None or solve.has_steps_of_derivatives(size))
+        and (solve.event is None or (solve.has_steps_of_derivatives(size) and _has_flow(solve, size)))
         and type(solve.controller) in (diffrax.PIDController, diffrax.ConstantStepSize)
         and solve.max_steps is not None
         and numbers * size <= largest
         and (is_recomputable(solve.solver) or replays(solve.solver))
     )
+
+
+def _has_flow(solve: "Solve", size: int) -> bool:
+    """Whether the end moves with its time as the equations say, of which a form has up to eight times as many unknowns."""
+    return isinstance(solve.formulation, AbstractFieldFormulation) or 8 * size <= LARGE
 
 
 def recorded(stages: bool) -> diffrax.SaveAt:
@@ -62,40 +69,15 @@ def recorded(stages: bool) -> diffrax.SaveAt:
 as_it_is = lambda t, y, ode: y
 
 
-class StepInputs(NamedTuple):
-    """What a solve depends on, once the state is encoded."""
-
-    formulation: Any
-    solver: Any
-    part: Any
-    t0: Any
-    t1: Any
-    dt0: Any
-    y: Any
-    ode: Any
-    view: Any
-    # Of events.
-    conditions: Any
-
-    def moving_apart(self, still: PyTree[Array]) -> tuple["StepInputs", "StepInputs"]:
-        """What has cotangents and the rest, where these arrays are `still`: what is none of them, and in any case the state."""
-        known = set(map(id, jax.tree.leaves(still)))
-        moves = lambda x: eqx.is_inexact_array(x) and id(x) not in known
-        flags = (
-            jax.tree.map(eqx.is_inexact_array if name == "y" else moves, part) for name, part in self._asdict().items()
-        )
-        return eqx.partition(self, StepInputs(*flags))
-
-
 def cotangents(
-    numbers: StepInputs,
-    rest: StepInputs,
+    numbers: "StepInputs",
+    rest: "StepInputs",
     fixed_steps: bool,
     trajectory: tuple[Float[Array, " steps"], Y, PyTree[Array]],
     wanted: tuple[Float[Array, " times"], PyTree[Array]],
     of_end: Scalar,
     stop: Stop | None,
-) -> StepInputs:
+) -> "StepInputs":
     """The cotangents of what moves.
 
     **Arguments**
@@ -249,7 +231,7 @@ def cotangents(
     )
 
 
-def with_times(of_inputs: StepInputs, of_t0: Scalar, of_t1: Scalar | None, of_times: Array | None) -> StepInputs:
+def with_times(of_inputs: "StepInputs", of_t0: Scalar, of_t1: Scalar | None, of_times: Array | None) -> "StepInputs":
     """`of_inputs` and what else its times have."""
     found = of_inputs._replace(t0=_plus(of_inputs.t0, of_t0), t1=_plus(of_inputs.t1, of_t1))
     if of_inputs.part.ts is None or of_times is None:
