@@ -119,6 +119,11 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "There were more resets than `Reset(max_resets=...)` allows: raise it, or look whether they pile up at one time, as "
         "those of a ball that comes to rest do."
     )
+    inconsistent_reset = (
+        "The state after a reset cannot be made consistent: near what the `reset` of `Reset(condition, reset)` gave, no "
+        "state was found that satisfies the equations and the hidden constraints with the `args` after it. The equations "
+        "may contradict each other from here on, too many entries may be `fixed`, or a number is not finite."
+    )
     undetermined_side = (
         "The condition of a Reset is zero at the start, or after a reset, stays there for a while, and is not zero at the end: it "
         "was not seen to which side it went, nor whether it came back. Say which crossings count: "

@@ -132,14 +132,14 @@ def below_roundoff(sol: DAESolution, controller: diffrax.AbstractStepSizeControl
 
 
 def _details(sol: DAESolution) -> tuple[Any, ...]:
-    return sol.result._value, sol.stats["end_time"], sol.t0, sol.t1, sol.stats["num_steps"]
+    return sol.result._value, sol.stats["end_time"], sol.t0, sol.t1, sol.stats["num_steps"], sol.stats.get("jumps", 0)
 
 
 def _sentence(details: tuple[np.ndarray, ...], off: Violation | None) -> str | None:
     """The sentence for numbers, or for arrays of a batch: that of the first of those that failed; `off`: how far its start is from
     the constraints.
     """
-    code, end, t0, t1, steps = details
+    code, end, t0, t1, steps, resets = details
     failed = np.flatnonzero(~np.isin(code, OKAY))
     if not failed.size:
         return None
@@ -149,6 +149,8 @@ def _sentence(details: tuple[np.ndarray, ...], off: Violation | None) -> str | N
         said = _of_one(off, failed[0], np.ndim(code)).message() + ADVICE
     if int(at(code)) not in _AT_START:
         said += f" The solve from t = {at(t0):.6g} to {at(t1):.6g} ended at t = {at(end):.6g} after {at(steps)} steps."
+    elif int(at(resets)):
+        said += f" The start meant is that after reset {at(resets)}, at t = {at(end):.6g}."
     if np.asarray(t0).dtype == np.float32:
         said += (
             " It ran in float32, which resolves 1.2e-07 of a number: for more, switch on float64 by "

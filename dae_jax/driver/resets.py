@@ -194,11 +194,14 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Start]
             lambda: _after(system, reset, end, reached, eqx.combine(p.args, others)),
             lambda: (jax.tree.map(jnp.asarray, reached), p.args, unknown, unknown, unknown),
         )
+        lost = jumps & ~exhausted & ~jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(y)]))
+        y = jax.tree.map(lambda x, before: jnp.where(lost, before, x), y, reached)
         times = jnp.where((jnp.arange(reset.max_resets) == p.count) & jumps & ~exhausted, end, p.times)
         code = jnp.where(jumps & exhausted, RESULTS.too_many_jumps._value, code)
+        code = jnp.where(lost, RESULTS.inconsistent_reset._value, code)
         if reset.direction is None:
-            lost = (side == 0) & _differs(reset.condition, end, reached, eqx.combine(p.args, others), *tolerances)
-            code = jnp.where(lost & (code == RESULTS.successful._value), RESULTS.undetermined_side._value, code)
+            unseen = (side == 0) & _differs(reset.condition, end, reached, eqx.combine(p.args, others), *tolerances)
+            code = jnp.where(unseen & (code == RESULTS.successful._value), RESULTS.undetermined_side._value, code)
         return _Progress(
             end, y, after, p.count + (jumps & ~exhausted), times, ts, ys, changed, stats, code, side, *of_reset
         )

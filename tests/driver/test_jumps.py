@@ -190,7 +190,7 @@ def test_refusals():
         bouncing(0.9, 2.0, solver=dae_jax.TangentSpace(diffrax.Tsit5()))
     away = dae_jax.Reset(lambda t, y, e, **_: y[0][1], lambda t, y, e: ((y[0] * jnp.nan, y[1]), e))
     sol = dae_jax.daesolve(BALL, diffrax.Tsit5(), 0.0, 2.0, None, RELEASED, 0.9, event=away, throw=False)
-    assert sol.result == dae_jax.RESULTS.inconsistent_start
+    assert sol.result == dae_jax.RESULTS.inconsistent_reset
 
 
 def held_or_pulled(t, y, yd, held):
