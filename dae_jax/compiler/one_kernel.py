@@ -113,10 +113,12 @@ class _Changes:
         return moved(lambda xs: inexact(self.forward(*jax.tree.unflatten(self.of_xs, xs))), xs, moving, dxs)
 
     def pulled(self, moving: Moving, xs: Arrays, cotangents: Arrays) -> Arrays:
-        """c·J."""
+        """c·J; 0 for c = 0 whatever J is: a result that a loss leaves out may be no number, nor J."""
         rest = iter(cotangents)
         cotangent = jax.tree.unflatten(self.of_ys, [next(rest) if i else None for i in self.inexact_ys])
-        return self.pull_back(jax.tree.unflatten(self.of_xs, xs), cotangent, moving)
+        found = self.pull_back(jax.tree.unflatten(self.of_xs, xs), cotangent, moving)
+        counts = jnp.asarray([jnp.any(c != 0) for c in cotangents], bool).any()
+        return [jnp.where(counts, x, jnp.zeros_like(x)) for x in found]
 
     # What moves first, `moving`, may depend on what moves `then` in a way that a function leaves out where that stands still, and so
     # on with what moves `later`: the inner derivative is by all of them.
