@@ -31,12 +31,13 @@ def nearest_point(
     inner: Callable[[Float[Array, " n"], Float[Array, " n"]], Float[Array, ""]],
     movable: Bool[Array, " n"] | Bool[np.ndarray, " n"],
     diagonal: Float[Array, " n"] | None = None,
+    begin: Float[Array, " n"] | None = None,
 ) -> Float[Array, " n"]:
     """y on the manifold H(y) = 0 at the least distance from `start`, by Gauss–Newton steps.
 
     `linearised(y, aim)` is the point next to `aim` on the linearisation of H = 0 at y, `aims(y)` what y is to be near to, and
     |x|² = `inner(x, x)`, in which what is not measured does not occur; `movable` is what is measured and free; `diagonal`, that of
-    the inner product, says how far it is in an entry's own unit.
+    the inner product, says how far it is in an entry's own unit; `begin`: where to begin, if not at `start`.
 
     First onto the manifold. Then a step is as long as makes the merit |y − start| + 3 |A⁺H| less, whose second term is about
     how far y is from the manifold: by the triangle inequality no point off the manifold has less than the nearest one. Full
@@ -76,5 +77,18 @@ def nearest_point(
     size, noise = relative_change, roundoff(start.dtype) ** 0.5
     directions = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, start.shape), start.dtype)
     one = jnp.ones((), start.dtype)
-    first = start, jnp.zeros_like(start), one * jnp.inf, 0 * one, jnp.asarray(False), one, 0
+    first = start if begin is None else begin, jnp.zeros_like(start), one * jnp.inf, 0 * one, jnp.asarray(False), one, 0
     return lax.while_loop(unfinished, step, first)[0]
+
+
+def finite_start(
+    violations: Callable[[Float[Array, " n"]], Float[Array, " m"]],
+    start: Float[Array, " n"],
+    movable: Bool[Array, " n"] | Bool[np.ndarray, " n"],
+) -> Float[Array, " n"]:
+    """`start`, or nearer to 0 by a power of 2, in what is `movable`, where an exponential does not overflow."""
+    shrunk = lambda part: jnp.where(movable, part * start, start)
+    is_finite = lambda part: jnp.all(jnp.isfinite(violations(shrunk(part))))
+    goes_on = lambda part: ~is_finite(part) & (part > SHORTEST)
+    part = lax.while_loop(goes_on, lambda part: part / 2, jnp.ones((), start.dtype))
+    return jnp.where(is_finite(part), shrunk(part), start)

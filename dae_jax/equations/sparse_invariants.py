@@ -84,8 +84,12 @@ class SparseInvariants:
         """
         a, h = self.entries(ode, t, y), ode.violations(t, y)
         b = h + self.row_sums(a * (start - y)[self.columns])
-        weights = self._by_speed(a, weights, derivatives)
+        # No part of the solution, which is differentiated.
+        weights = jax.lax.stop_gradient(self._by_speed(a, weights, derivatives))
         s = a * weights[self.columns]
+        # To length 1 by way of a largest entry of 1, as squares overflow before numbers do.
+        largest = scaling(jax.lax.stop_gradient(jax.ops.segment_max(jnp.abs(s), self.rows, self.m)))
+        s, b = s * largest[self.rows], b * largest
         scale = scaling(jnp.sqrt(self.row_sums(s * s)))
         s, b = s * scale[self.rows], b * scale
         # What the free entries cannot mend stays as it is, in place of growing without bound.

@@ -21,8 +21,10 @@ from ..linalg import (
     semidefinite_solve,
     signed_log_determinant,
     solve,
+    solve_contraction,
     take,
     tearing,
+    while_progress,
 )
 from ..structure import Block, block_triangular, interpreted
 from ..systems import System, is_mechanism
@@ -32,7 +34,7 @@ from .derivative_orders import Combination, derivative_of, find_offsets
 from .initial_rates import is_nonlinear, rates_of
 from .manifold_ode import Feedback, ManifoldODE, at_one_instant, constant
 from .mechanical import MechanicalODE
-from .nearest_point import nearest_point
+from .nearest_point import SHORTEST, finite_start, nearest_point
 from .nearest_step import step_to
 from .orders import Orders
 from .probe import Probe
@@ -76,9 +78,9 @@ class StructuralODE(ManifoldODE):
     metric: Float[Array, " N"] | None = None
 
     @classmethod
-    def of(cls, form: ResidualForm, dtype: DType, complete: bool = False) -> "StructuralODE":
-        """Finds the offsets while tracing. `complete`: once more than needed, so that all variables are in the state and
-        all that restricts them is among the invariants.
+    def of(cls, form: ResidualForm, dtype: DType, complete: int = 0) -> "StructuralODE":
+        """Finds the offsets while tracing. `complete`: so many times more than needed; with one all variables are in the state and all
+        that restricts them is among the invariants.
 
         Errors: `ValueError` for a structurally singular system.
         """
@@ -89,7 +91,7 @@ class StructuralODE(ManifoldODE):
             return cls(form, found.combination, Orders(*(tuple(k + more for k in c) for c in offsets)), Tearing())
 
         if complete:
-            ode = differentiated(1)
+            ode = differentiated(complete)
             sparse = SparseInvariants.of(ode, found.occurrence) if form.size > LARGE else None
             return dataclasses.replace(ode, sparse=sparse)
         ode = differentiated(0)
@@ -225,6 +227,13 @@ class StructuralODE(ManifoldODE):
         along = jnp.abs(jnp.sum((there - here) * moves, 1)) / jnp.sum(here * moves, 1)
         return jnp.where(jnp.any(along > TURNS), lasting(here, there), here)
 
+    def overflows(self, t: Time, y: Float[Array, " N"]) -> Bool[Array, " N"]:
+        """The entries of Y by which a derivative of H is not finite."""
+        if self.sparse is None:
+            return ~jnp.all(jnp.isfinite(self.jacobian(t, y)), 0)
+        finite = jnp.isfinite(self.sparse.entries(self, t, y)).astype(y.dtype)
+        return jax.ops.segment_min(finite, self.sparse.columns, y.size) < 1
+
     def sizes(self, t: Time, y: Float[Array, " N"], of: tuple[Float[Array, " N"], ...]) -> list[Float[Array, " m"]]:
         """Σ |∂H/∂Y| s of each invariant, for each s in `of`."""
         if self.sparse is not None:
@@ -318,11 +327,13 @@ class StructuralODE(ManifoldODE):
         freedom: Float[Array, " n"] | None,
         ydot: Float[Array, " n"] | None = None,
         counted: Bool[Array, " n"] | None = None,
+        near: bool = False,
     ) -> Float[Array, " N"]:
         """Y near the values of the variables, each of which may move as much as its `freedom` says (0: not at all; 1: no
         more than the others; `None`: none moves), with the least H; those that are not `counted` (`None`: all are) move for nothing.
         Gauss–Newton's method; the derivatives from 0, the first ones from what is known of them or, where F is nonlinear in them, from
-        such as satisfy it; these are `ydot` where that is given.
+        such as satisfy it; these are `ydot` where that is given. `near`: from values that are consistent but for changes that derivatives
+        are by.
         """
         index, dtype = self.orders.values, values.dtype
         moves = take(jnp.zeros_like(values) if freedom is None else freedom.astype(dtype), index)
@@ -337,7 +348,7 @@ class StructuralODE(ManifoldODE):
         else:
             ydot = self.form.known_ydot(values)
         known = known + take(ydot, first)
-        return _nearest(self, t, known, weights, counts, freedom is not None)
+        return _nearest(self, t, known, weights, counts, freedom is not None and not near)
 
 
 def _nearest(
@@ -359,40 +370,60 @@ def _nearest(
         a, h = ode.jacobian(t, y), ode.violations(t, y)
         return aim + step_to(a, h + jnp.sum(a * (aim - y), 1), weights, counts == 0)
 
-    def settled(y: Float[Array, " N"], aims: Callable[[Array], Array], params: PyTree) -> Any:
-        def correct(y: Float[Array, " N"]) -> Any:
-            new = moved(y, aims(y), params)
-            return new, relative_change(new - y, y)
+    def settled(y: Float[Array, " N"], aims: Callable[[Array], Array], params: PyTree, damped: bool = False) -> Any:
+        ode, t = params[:2]
 
-        return fixed_point(correct, y, max_steps=STARTING)
+        def correct(y: Float[Array, " N"]) -> Any:
+            way = moved(y, aims(y), params) - y
+            return y + (_damped(ode, t, y, way) if damped else 1) * way, relative_change(way, y)
+
+        return while_progress(correct, y, lambda y: ode.violations(t, y), STARTING)
 
     given = ode, t, known, weights, counts
     held = constant(given)
     start, measured = held[2], (held[4] > 0) & (held[3] > 0)
     # Derivatives have nothing to be near to but what the equations make of them.
     aims = lambda y: jnp.where(held[4] > 0, start, y)
+    begin = start
+    if values_move:
+        overflows = held[0].overflows(held[1], start)
+        begin = finite_start(lambda y: held[0].violations(held[1], y), start, (held[3] > 0) & overflows)
     if not values_move:
         first = start
     elif ode.sparse is not None:
         # Solved in parts as small as round-off, a large linearisation does not say how far off a point is.
-        first, _ = settled(start, aims, held)
+        first, _ = settled(begin, aims, held, damped=True)
     else:
         scale = jnp.where(measured, 1 / jnp.where(measured, weights, 1), 0)
         inner = lambda a, b: jnp.sum(scale * a * scale * b)
-        first = nearest_point(lambda y, aim: moved(y, aim, held), start, aims, inner, measured)
+        first = nearest_point(lambda y, aim: moved(y, aim, held), start, aims, inner, measured, begin=begin)
     params = (*given, first)
     # A little of a pull keeps the derivatives that the equations leave open from being undetermined.
     pull = jnp.finfo(known.dtype).eps ** 0.6
     aim = lambda y, params: jnp.where(params[4] > 0, params[2], y - pull * (y - params[5]))
     # From the nearest point on, what `cut` has left of H there.
     iterate = lambda params: settled(params[5], lambda y: y, params)
-    return implicit_root(
-        lambda y, p: y - moved(y, aim(y, p), p), iterate, params, jacobian=_by_y if ode.sparse else None
-    )[0]
+    off = lambda y, p: y - moved(y, aim(y, p), p)
+    if ode.sparse is None:
+        return implicit_root(off, iterate, params)[0]
+
+    def solved(at: tuple[Float[Array, " N"], PyTree], b: Float[Array, " N"]) -> Any:
+        y, p = at
+        # What was found by substitution is differentiated by it, in products of its sparse factors.
+        return solve_contraction(jax.linearize(lambda y: moved(y, aim(y, p), p), y)[1], b)
+
+    return implicit_root(off, iterate, params, linear_solve=solved, jacobian=lambda y, p: (y, p))[0]
 
 
-def _by_y(*_: object) -> Any:
-    raise NotImplementedError(f"The derivative of a consistent state is for up to {LARGE} unknowns.")
+def _damped(ode: StructuralODE, t: Time, y: Float[Array, " N"], way: Float[Array, " N"]) -> Any:
+    """How much of a correction to go: as much as leaves no more of an equation than it has in terms."""
+    assert ode.sparse is not None
+    entries, off = jnp.abs(ode.sparse.entries(ode, t, y)), jnp.abs(ode.violations(t, y))
+    terms, sizes = (ode.sparse.row_sums(entries * jnp.abs(x)[ode.sparse.columns]) for x in (way, y))
+    round_off = OFF * jnp.finfo(y.dtype).eps * sizes
+    # A comparison with what is not finite is false.
+    is_near = lambda part: jnp.all(jnp.abs(ode.violations(t, y + part * way)) <= 2 * (off + part * terms) + round_off)
+    return lax.while_loop(lambda part: ~is_near(part) & (part > SHORTEST), lambda part: part / 2, jnp.ones((), y.dtype))
 
 
 def underlying_ode(

@@ -1,5 +1,6 @@
 """Linear and nonlinear equations of a few unknowns, solved in plain arithmetic; LAPACK above a measured size."""
 
+from .contraction import solve_contraction as solve_contraction
 from .definite_factors import Factors as Factors, factorised as factorised, solve_with as solve_with
 from .dense import (
     determinant_sign as determinant_sign,
@@ -17,6 +18,7 @@ from .newton import (
     newton as newton,
     relative_change as relative_change,
     roundoff as roundoff,
+    while_progress as while_progress,
 )
 from .norm import error_norm as error_norm, rms_norm as rms_norm
 from .semidefinite import semidefinite_solve as semidefinite_solve, smallest_pivot as smallest_pivot

@@ -18,6 +18,8 @@ from .dense import solve
 
 
 MAX_STEPS = 20
+# How often so many steps are made where each time an exponential has come down: a number has 709 factors of e.
+ROUNDS = 9
 
 
 def roundoff(dtype: DType) -> float:
@@ -121,6 +123,30 @@ def fixed_point(
     return x, (remaining <= tolerance) | (size <= previous / 2) & (size < 1000 * tolerance) | stagnant(
         size, previous, turned
     )
+
+
+def while_progress(
+    correct: Callable[[Any], tuple[Any, Float[Array, ""]]],
+    x: Any,
+    residual: Callable[[Any], Float[Array, " m"]],
+    max_steps: int,
+) -> tuple[Any, Bool[Array, ""]]:
+    """`fixed_point`, after each `max_steps` once more if the largest residual has become less than a thousandth in these: far up an
+    exponential a correction takes it down by a factor of e.
+    """
+
+    def more(carry: Any) -> Any:
+        x, _, now, _, count = carry
+        new, found = fixed_point(correct, x, max_steps=max_steps)
+        return new, found, jnp.max(jnp.abs(residual(new)), initial=0.0), now, count + 1
+
+    def goes_on(carry: Any) -> Bool[Array, ""]:
+        _, found, now, before, count = carry
+        return (count == 0) | ~found & (now < before / 1000) & (count < ROUNDS)
+
+    infinite = jnp.full((), jnp.inf, jnp.result_type(*jax.tree.leaves(x)))
+    x, found, *_ = lax.while_loop(goes_on, more, (x, jnp.asarray(False), infinite, infinite, 0))
+    return x, found
 
 
 def _inner(a: Any, b: Any) -> Float[Array, ""]:

@@ -161,8 +161,36 @@ def test_the_nearest_consistent_state_of_a_large_system():
     a = np.eye(161)[:-1] + np.eye(161, k=1)[:-1]
     nearest = off["v"] - np.linalg.pinv(a) @ (a @ off["v"])
     np.testing.assert_allclose(found["v"], nearest, atol=1e-8)
-    with pytest.raises(NotImplementedError, match="up to 256 unknowns"):
-        jax.grad(lambda v: dae_jax.consistent_state(PUSHED, 0.0, {"v": v, "p": y0["p"]}, FORCE)["v"].sum())(off["v"])
+    weights = rng.normal(size=161)
+    found = lambda v: dae_jax.consistent_state(PUSHED, 0.0, {"v": v, "p": y0["p"]}, FORCE)["v"] @ weights
+    np.testing.assert_allclose(jax.grad(found)(off["v"]), weights - np.linalg.pinv(a) @ (a @ weights), atol=1e-8)
+
+
+def test_derivatives_of_the_nearest_consistent_state_of_a_large_system():
+    """On the curved z = a x² + shift(x)/10, with the derivatives of its conditions of Lagrange by a dense solve."""
+    n, z0 = 150, jnp.zeros(150)
+    system = dae_jax.SemiExplicitDAE(lambda t, x, z, a: -x, lambda t, x, z, a: z - a * x**2 - 0.1 * jnp.roll(x, 1))
+    x0, a = jnp.linspace(0.1, 1, n), 0.3
+    found = lambda a, **options: jnp.concatenate(dae_jax.consistent_state(system, 0.0, (x0, z0), a, **options))
+
+    def conditions(w, a):
+        x, z, multiplier = jnp.split(w, 3)
+        g, pull = jax.vjp(lambda x, z: z - a * x**2 - 0.1 * jnp.roll(x, 1), x, z)
+        along_x, along_z = pull(multiplier)
+        return jnp.concatenate([x - x0 + along_x, z - z0 + along_z, g])
+
+    w = np.concatenate([x0, z0, z0])
+    slope = jax.jit(jax.jacfwd(conditions))
+    for _ in range(20):
+        w = w - np.linalg.solve(slope(w, a), conditions(w, a))
+    exact = -np.linalg.solve(slope(w, a), jax.jacfwd(conditions, 1)(w, a))[: 2 * n]
+    value, change = jax.jvp(found, (a,), (1.0,))
+    np.testing.assert_allclose(value, w[: 2 * n], atol=1e-12)
+    np.testing.assert_allclose(change, exact, atol=1e-11)
+    gradient = jax.grad(lambda a: jnp.sum(found(a) ** 2))(a)
+    np.testing.assert_allclose(gradient, 2 * w[: 2 * n] @ exact, rtol=1e-11)
+    fixed = jax.grad(lambda a: jnp.sum(found(a, fixed=(True, False))))(a)
+    np.testing.assert_allclose(fixed, jnp.sum(x0**2), rtol=1e-11)
 
 
 def test_a_reset_of_a_large_system():
@@ -180,3 +208,13 @@ def test_a_reset_of_a_large_system():
     exact[1] += np.exp(-rates[1] * (1 - np.log(2)))
     np.testing.assert_allclose(x, exact, atol=1e-5)
     np.testing.assert_allclose(z, -rates * exact, atol=2e-5)
+
+    def kick(size, adjoint):
+        kicked = dae_jax.Reset(condition, lambda t, y, a: ((y[0].at[1].add(a), y[1]), a), fixed=(True, False))
+        sol = dae_jax.daesolve(system, dae_jax.BDF(), 0.0, 1.0, None, start, size, event=kicked, adjoint=adjoint)
+        return sol.final[0][1]
+
+    slope = np.exp(-rates[1] * (1 - np.log(2)))
+    forward = jax.jvp(lambda size: kick(size, diffrax.ForwardMode()), (1.0,), (1.0,))[1]
+    reverse = jax.grad(lambda size: kick(size, diffrax.RecursiveCheckpointAdjoint()))(1.0)
+    np.testing.assert_allclose([forward, reverse], slope, atol=1e-5)
