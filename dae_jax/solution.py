@@ -247,11 +247,28 @@ class DAESolution(eqx.Module):
         """
         return VIEWS["animate"](what, self, **options)
 
+    def __repr__(self) -> str:
+        """As of any module; of a batch how many solves were successful in place of a sentence for each."""
+        value = getattr(self.result, "_value", None)
+        if value is None or isinstance(value, Tracer) or np.ndim(value) == 0:
+            return eqx.tree_pformat(self)
+        return eqx.tree_pformat(eqx.tree_at(lambda sol: sol.result, self, _Words(_result(self.result))))
+
     def _repr_html_(self) -> str:
         """A table for a notebook; nothing is computed."""
         if any(isinstance(x, Tracer) for x in jax.tree.leaves(self)):
             return table("DAESolution", {"traced": "inside jit, vmap or grad"})
         return table("DAESolution", _found(self))
+
+
+class _Words:
+    """What is printed as it is."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+
+    def __repr__(self) -> str:
+        return f"<{self.text}>"
 
 
 def _found(sol: DAESolution) -> dict[str, str]:

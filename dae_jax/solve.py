@@ -17,7 +17,13 @@ from .driver.doubts import warn
 from .driver.ends import Start
 from .driver.event_functions import refuse_other_outputs
 from .driver.failures import OKAY, below_roundoff, in_words, not_finite_beyond, raised_in_the_program, undetermined
-from .driver.options import refuse_misfits, refuse_no_event, refuse_other_steps, refuse_wrong_options
+from .driver.options import (
+    refuse_misfits,
+    refuse_no_event,
+    refuse_other_steps,
+    refuse_wrong_options,
+    with_known_options,
+)
 from .driver.problem import Problem, Program, split
 from .driver.program import KEPT, Solve, run, traces
 from .driver.resets import Reset
@@ -47,6 +53,7 @@ _of_known_rank: dict[Program, Program] = {}
 _with_few: set[int] = set()
 
 
+@with_known_options
 @at_ease
 def daesolve(
     system: System,
@@ -131,7 +138,8 @@ def daesolve(
         settle(program.leaves)
     sol = _raise_if_failed(sol, solve, problem, start.off) if throw else sol
     if not isinstance(sol.stats["doubts"], Tracer):
-        warn(sol, stacklevel=2)
+        # Beyond what this function is wrapped in.
+        warn(sol, stacklevel=4)
     return sol
 
 

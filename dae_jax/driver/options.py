@@ -1,7 +1,10 @@
 """How to solve: options of a wrong type, and methods that do not fit each other, are refused in a sentence."""
 
 import functools
+import inspect
 import typing
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
 
 import diffrax
 import optimistix
@@ -13,6 +16,9 @@ from ..types import Time
 from ..validate.states import brief
 from .resets import Reset
 
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 EXPECTED = {
     "saveat": (diffrax.SaveAt, "a diffrax.SaveAt such as diffrax.SaveAt(ts=jnp.linspace(t0, t1, 101))"),
@@ -27,6 +33,36 @@ EXPECTED = {
     ),
     "progress_meter": (diffrax.AbstractProgressMeter, "a progress meter such as diffrax.TqdmProgressMeter()"),
 }
+
+
+# What others call what goes by another name here.
+ELSEWHERE = {
+    "rtol": "a tolerance goes into `stepsize_controller=diffrax.PIDController(rtol=1e-6, atol=1e-6)`",
+    "atol": "a tolerance goes into `stepsize_controller=diffrax.PIDController(rtol=1e-6, atol=1e-6)`",
+    "dt": "a fixed step is `dt0`",
+    "ts": "times to save at go into `saveat=diffrax.SaveAt(ts=...)`",
+    "t_eval": "times to save at go into `saveat=diffrax.SaveAt(ts=...)`",
+    "method": "a method is the second argument, such as dae_jax.RadauIIA5()",
+    "controller": "a step-size controller is `stepsize_controller`",
+    "events": "an event is `event`, or several in one diffrax.Event",
+}
+ELSEWHERE |= {"tol": ELSEWHERE["rtol"], "t_span": "the order is system, solver, t0, t1, dt0, y0, args"}
+
+
+def with_known_options(fn: Callable[P, T]) -> Callable[P, T]:
+    """`fn`, which says of an argument that it does not know by which one to say that."""
+    known = list(inspect.signature(fn).parameters)
+
+    @functools.wraps(fn)
+    def called(*args: P.args, **kwargs: P.kwargs) -> T:
+        unknown = kwargs.keys() - set(known)
+        if unknown:
+            name = min(unknown, key=lambda name: (name not in ELSEWHERE, name))
+            advice = ELSEWHERE.get(name) or f"there are {', '.join(f'`{x}`' for x in known)}"
+            raise TypeError(f"`{getattr(fn, '__name__', fn)}` has no argument `{name}`: {advice}.")
+        return fn(*args, **kwargs)
+
+    return called
 
 
 def refuse_wrong_options(

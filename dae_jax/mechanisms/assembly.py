@@ -19,6 +19,7 @@ from ..validate.states import brief, refuse_wrong_state
 from ..validate.user_functions import refuse_wrong_functions
 from .bodies import GROUND, inverse_roots, numbers
 from .configuration import Coordinate, Coordinates, is_within_half_a_turn
+from .contacts import Motion
 from .joints import Joint
 from .loads import Along
 from .outputs import coordinate_named
@@ -45,9 +46,9 @@ def assembled(
     """The consistent state nearest to a guess, with these values of coordinates and rates."""
     numbers("`t0`", t0, ())
     start, at, rates = _start(mechanism, guess), _values("at", at), _values("rates", rates)
+    coordinates = {name: coordinate_named(mechanism, name) for name in (*at, *rates)}
     # What is wrong with a function is no matter of closing.
     refuse_wrong_functions(mechanism.system(), t0, start, args)
-    coordinates = {name: coordinate_named(mechanism, name) for name in (*at, *rates)}
     # Loads neither, which derivatives may be by, while all else is known.
     mechanism = type(mechanism)(mechanism.bodies, mechanism.joints)
     if at.keys() - rates.keys():
@@ -89,8 +90,9 @@ def _closed(
             try:
                 return consistent_state(system, t0, (nearest, start[1]), args)
             except ValueError:
-                raise ValueError(_message({}, 0.0)) from refusal
-        raise ValueError(_message(open_by, CLOSED * scale)) from refusal
+                raise ValueError(_message({}, 0.0, set())) from refusal
+        motors = {joint.name for joint in mechanism.joints if isinstance(joint, Motion)}
+        raise ValueError(_message(open_by, CLOSED * scale, motors)) from refusal
 
 
 def rank(mechanism: "Mechanism", y0: tuple[Coordinates, Coordinates], t0: Time, args: Args) -> tuple[int, int]:
@@ -274,7 +276,7 @@ def _closing(mechanism: "Mechanism") -> list[str]:
     return closing
 
 
-def _message(gaps: dict[str, float], allowed: float) -> str:
+def _message(gaps: dict[str, float], allowed: float, motors: set[str]) -> str:
     still_open = sorted(((gap, name) for name, gap in gaps.items() if gap > allowed), reverse=True)
     if not still_open:
         return (
@@ -283,6 +285,12 @@ def _message(gaps: dict[str, float], allowed: float) -> str:
         )
     gap, worst = still_open[0]
     others = "".join(f"\n  {name!r} by {gap:.6g}" for gap, name in still_open[1:])
+    if worst in motors:
+        return (
+            f"The mechanism cannot be assembled from this guess: motor {worst!r} is off its motion by {gap:.6g} when all joints are closed "
+            "(m, or rad of an angle). A value in `at` contradicts `motion(t0, args)`, or the joints do not let it get there."
+            + (f"\nAlso off:{others}" if others else "")
+        )
     return (
         f"The mechanism cannot be assembled from this guess: joint {worst!r} stays open by {gap:.6g} when all others are closed as "
         "far as they can be (m, or rad of an angle). Bodies are too short or too long for this loop, or the guess is "

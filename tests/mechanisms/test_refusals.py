@@ -167,6 +167,24 @@ def test_a_rate_that_no_joint_allows_is_refused():
         held.assemble(rates={"hinge": 1.0})
 
 
+def test_a_name_that_is_none_is_refused_before_functions_are_asked():
+    def wrong(t, c, rate, args):
+        raise RuntimeError("asked")
+
+    driven = m.Mechanism([ROD], [HINGE], [m.motor(HINGE, torque=wrong)])
+    for given in ("at", "rates"):
+        with pytest.raises(ValueError, match="There is no coordinate 'hinch'; there are"):
+            driven.assemble(**{given: {"hinch": 0.3}})
+
+
+def test_a_motor_that_contradicts_what_is_asked_for_is_named_as_one():
+    drive = m.motor(HINGE, motion=lambda t, args: 0.5 + t, name="drive")
+    with pytest.raises(
+        ValueError, match=r"motor 'drive' is off its motion by 0\.2 (.|\n)* in `at` contradicts `motion"
+    ):
+        m.Mechanism([ROD], [HINGE, drive]).assemble(at={HINGE.name: 0.3})
+
+
 def test_a_joint_without_a_value_at_the_guess_is_named():
     wheel = m.Body("wheel", 1.0, (0.1, 0.1, 0.1), at=(0, 0, 1))
     joint = m.rolling(m.ground, wheel, radius=1.0, at=(0, 0, 0), normal=(0, 0, 1), axis=(0, 0, 1), name="tyre")
