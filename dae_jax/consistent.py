@@ -16,6 +16,7 @@ from .equations.linearised import LinearisedResidual
 from .equations.manifold_ode import constant
 from .equations.mechanical import MechanicalODE
 from .equations.nearest_point import nearest_point
+from .equations.raised_index import FOR_VALUES
 from .equations.regularity import ALONG, mass_is_regular, mass_message
 from .equations.residual_form import ResidualForm, weighted
 from .equations.structural_ode import StructuralODE
@@ -172,18 +173,17 @@ def consistent_state(
     - `yd0`: near which ẏ is looked for, for an `ImplicitDAE` that is nonlinear in it.
 
     Errors: `ValueError` where no such state is found from here, naming the equations that remain off; NaN where the arguments are
-    traced, of a mechanism within `jit` and `vmap` only; `NotImplementedError` for its derivative where it has more than 256
-    unknowns and hidden equations.
+    traced, of a mechanism within `jit` and `vmap` only.
     """
     return _consistent(system, t0, y0, args, fixed, rates, yd0)
 
 
-def consistent_after(system: System, t: Time, y: State, args: Args, fixed: State) -> Any:
+def consistent_after(system: System, t: Time, y: State, args: Args, fixed: State, raised: bool = False) -> Any:
     """The nearest consistent state to one that a reset has made. Of a system that is no mechanism, variables whose derivative occurs in
     the equations alone count for the distance, if they move less so: who lets a ball bounce does not say what becomes of a contact's
-    force, and no part of the way to that is one of its velocity.
+    force, and no part of the way to that is one of its velocity. `raised`: whether the index may be higher than the structure has it.
     """
-    return _consistent(system, t, y, args, fixed, keeps=True)
+    return _consistent(system, t, y, args, fixed, keeps=True, raised=raised)
 
 
 def _consistent(
@@ -195,6 +195,7 @@ def _consistent(
     rates: State = None,
     yd0: State = None,
     keeps: bool = False,
+    raised: bool = False,
 ) -> Any:
     refuse_wrong_state(system, y0)
     system, args = opened(current((with_rates(system, yd0, y0), args)))
@@ -210,7 +211,7 @@ def _consistent(
     if is_mechanism(system) and rates is None:
         found, fine, remains = _nearest_of_mechanism(system, t0, y0, args, masks)
     else:
-        found, fine, remains = _nearest_of_any(system, t0, y0, args, masks, rates, keeps)
+        found, fine, remains = _nearest_of_any(system, t0, y0, args, masks, rates, keeps, raised)
     if not isinstance(fine, Tracer) and not bool(fine):
         said, instead = "The initial state `y0` violates", "No consistent state was found near `y0`; left over are"
         raise ValueError(
@@ -237,12 +238,19 @@ def _nearest_of_mechanism(system: ConstrainedSystem, t: Time, y0: State, args: A
 
 @quickly_compiled
 def _nearest_of_any(
-    system: System, t: Time, y0: State, args: Args, masks: State, rates: State, keeps: bool = False
+    system: System,
+    t: Time,
+    y0: State,
+    args: Args,
+    masks: State,
+    rates: State,
+    keeps: bool = False,
+    raised: bool = False,
 ) -> Any:
     form = ResidualForm.of(system, t, y0, args)
     values = form.encode(y0)
     t = jnp.asarray(t, values.dtype)
-    ode = StructuralODE.of(form, values.dtype, complete=True)
+    ode = StructuralODE.of(form, values.dtype, FOR_VALUES if raised else 1)
     rates = None if rates is None else form.encode(rates)
     freedom = jnp.where(form.encode(masks), 0, 1)
 

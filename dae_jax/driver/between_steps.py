@@ -29,10 +29,13 @@ def has_flow(formulation: AbstractFormulation, y: Y) -> bool:
 
 
 class Flow(eqx.Module):
-    """Where points move with their time. `later`: a derivative that is not by it may be differentiated by it later on."""
+    """Where points move with their time. `later`: a derivative that is not by it may be differentiated by it later on.
+    `raised`: whether a reset may have raised the index of the equations.
+    """
 
     formulation: AbstractFormulation
     later: bool = eqx.field(static=True, default=True)
+    raised: bool = eqx.field(static=True, default=False)
 
 
 @eqx.filter_custom_jvp
@@ -69,8 +72,9 @@ def _moved(ends: Callable[[Time], tuple[Time, Time]], primals: Any, tangents: An
 
     def step(y: Y, t: Time, flow: Flow, ode: Equations) -> Any:
         start, end = ends(t)
+        of_residual = functools.partial(shown_rates, raised=flow.raised)
         h, formulation = jnp.asarray(end - start), flow.formulation
-        field: Any = formulation.field if isinstance(formulation, AbstractFieldFormulation) else shown_rates
+        field: Any = formulation.field if isinstance(formulation, AbstractFieldFormulation) else of_residual
         plus = lambda h, y, rates: jax.tree.map(lambda y, rate: y + h * rate, y, rates)
 
         # A loop, as the field may be large, and its derivatives are larger.

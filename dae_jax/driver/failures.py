@@ -213,9 +213,14 @@ def refused_on_the_way(steps: Steps, most: int) -> Steps:
         "The derivative of a solve is not known: its steps, which are shorter than those of the solution where it needs that, do not "
         f"lead to the end. Raise `max_steps`, which is {most}. With `throw=False` the derivative is NaN instead."
     )
+    return steps._replace(times=refused_where(~reach(of_bits(steps)), sentence, steps.times))
+
+
+def refused_where(wrong: BoolScalar, sentence: str, x: Array) -> Array:
+    """A vector x in a program in which it raises a `SolveFailed` where something is `wrong`."""
     fail = lambda: jax.pure_callback(functools.partial(_raise, sentence), jnp.zeros((), int))
-    none = lax.cond(unvmap_any(~reach(of_bits(steps))), fail, lambda: jnp.zeros((), int))
-    return steps._replace(times=steps.times.at[0].add(none.astype(steps.times.dtype)))
+    none = lax.cond(unvmap_any(wrong), fail, lambda: jnp.zeros((), int))
+    return x.at[0].add(none.astype(x.dtype))
 
 
 def _off(program: Program, numbers: list[Array]) -> Violation | None:

@@ -120,7 +120,7 @@ def run(program: Program, arrays: Arrays) -> tuple[DAESolution, Start, float]:
 @functools.partial(
     jax.tree_util.register_dataclass,
     data_fields=("formulation", "solver", "saveat", "controller", "adjoint", "event", "progress_meter"),
-    meta_fields=("max_steps", "throw", "recording", "counts_between"),
+    meta_fields=("max_steps", "throw", "recording", "counts_between", "raises_index"),
 )
 @dataclasses.dataclass(frozen=True, eq=False)
 class Solve:
@@ -140,6 +140,8 @@ class Solve:
     recording: bool = False
     # Whether steps are to be good between their ends though nothing is saved there.
     counts_between: bool = False
+    # Whether a reset may have raised the index of the equations.
+    raises_index: bool = False
 
     def __call__(self, problem: Problem) -> tuple[DAESolution, Start]:
         backwards = problem.t1 < problem.t0
@@ -267,7 +269,7 @@ class Solve:
         """Where points move with their time: the time of an event is that where a condition is zero, whose derivative by others, at that
         time, has one by it.
         """
-        return Flow(self.formulation, later=self.derivative() == "any" or self.event is not None)
+        return Flow(self.formulation, self.derivative() == "any" or self.event is not None, self.raises_index)
 
     def is_still(self, y: Y) -> bool:
         """Whether the steps of a solve from y do not move with times: all but fixed ones, of which the solution is what they give."""

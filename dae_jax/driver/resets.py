@@ -16,12 +16,14 @@ from .._compat import while_loop
 from ..compiler import one_kernel
 from ..compiler.types import Arrays
 from ..consistent import consistent_after
+from ..equations.raised_index import may_be_raised
 from ..solution import RESULTS, DAESolution, Split, last_saved, precision_of
-from ..systems import System
+from ..systems import System, is_mechanism
 from ..types import Args, BoolScalar, Scalar, State, Time
 from ..validate.states import NUMBERS, brief
 from .bracket import Bracket
 from .ends import Start
+from .known_derivatives import refused_if_unknown
 from .problem import Problem, count_of, split
 from .reset_levels import FromStart, error_of, level_at_start
 from .start import saved_parts
@@ -63,8 +65,9 @@ class Reset(eqx.Module):
     after it.
 
     A reset may change in `args` which equations hold. Where it changes their index, as an ideal diode that closes or opens does beside
-    a coil, `RadauIIA5` and `BDF` go on, but derivatives after it are NaN, and solvers by way of the underlying ODE stop there: write a
-    small and a large resistance in place of the ideal switch.
+    a coil, `RadauIIA5` and `BDF` go on, and solvers by way of the underlying ODE stop there: for these write a small and a large
+    resistance in place of the ideal switch. Where it is higher by two or more than the structure has it, derivatives after it are an
+    error.
     """
 
     condition: Callable[..., Any]
@@ -131,7 +134,12 @@ def solve_with_resets(solve: "Solve", problem: Problem) -> tuple[DAESolution, St
 
     forward, _ = parts(solve.forwards())
     numbers, arrays = parts(solve)
-    return one_kernel(numbers, solve.derivative(), None, forward)(arrays).whole()
+    checked = solve.throw and solve.derivative() != "any"
+    arrays = refused_if_unknown(arrays, given=True) if checked else arrays
+    sol, start = one_kernel(numbers, solve.derivative(), None, forward)(arrays).whole()
+    if checked:
+        sol = dataclasses.replace(sol, ys=refused_if_unknown(sol.ys, given=False), given=sol.given)
+    return sol, start
 
 
 def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Start]:
@@ -145,6 +153,9 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Start]
     )
     sign = jnp.where(t1 < t0, -1, 1).astype(t0.dtype)
     changes = _changes(reset, t0, y0, args)
+    # Other numbers in the equations may leave out what the structure has in them.
+    changes_args = any(jax.tree.leaves(changes))
+    raised = changes_args and not is_mechanism(system) and may_be_raised(system, t0, y0, args)
     numbers, others = eqx.partition(args, _is_number)
     # In which the order of resets is round-off.
     together = 16 * float(jnp.finfo(t0.dtype).eps) ** 0.75 * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
@@ -169,7 +180,7 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Start]
         # No maximum, whose derivative is shared out between equal numbers.
         later = jnp.where(sign * wanted < sign * p.t, p.t, wanted)
         both = dataclasses.replace(output, t0=False, t1=True, ts=later, fn=_WithState(output.fn))
-        one = dataclasses.replace(solve, event=event, saveat=diffrax.SaveAt(subs=both))
+        one = dataclasses.replace(solve, event=event, saveat=diffrax.SaveAt(subs=both), raises_index=raised)
         sol, _ = one(dataclasses.replace(problem, t0=p.t, y0=p.y, args=args))
         return dataclasses.replace(sol, given=None), side
 
@@ -191,7 +202,7 @@ def _part_by_part(solve: "Solve", problem: Problem) -> tuple[DAESolution, Start]
         jumps, exhausted = code == going, piled | (p.count >= reset.max_resets)
         y, after, *of_reset = lax.cond(
             jumps & ~exhausted,
-            lambda: _after(system, reset, end, reached, eqx.combine(p.args, others)),
+            lambda: _after(system, reset, end, reached, eqx.combine(p.args, others), raised),
             lambda: (jax.tree.map(jnp.asarray, reached), p.args, unknown, unknown, unknown),
         )
         lost = jumps & ~exhausted & ~jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(y)]))
@@ -271,18 +282,20 @@ def _changes(reset: Reset, t: Time, y: State, args: Args) -> PyTree[bool]:
     return found[0]
 
 
-def _after(system: System, reset: Reset, t: Time, y: State, args: Args) -> tuple[Any, Any, Scalar, Scalar, Scalar]:
+def _after(
+    system: System, reset: Reset, t: Time, y: State, args: Args, raised: bool
+) -> tuple[Any, Any, Scalar, Scalar, Scalar]:
     """The state and the numbers in the args after a reset; whether the state is another; the condition before it, which is zero but for
     the resolution of time, and by how much it is off with the state that was found: by so much it moves as that is made consistent. (As
     the state after it is, the condition may come to move by more: a rod that is longer from here on has left the stop.)
     """
     wanted, new = reset.reset(t, y, args)
-    consistent = consistent_after(system, t, wanted, new, reset.fixed)
+    consistent = consistent_after(system, t, wanted, new, reset.fixed, raised)
     of = lambda y, args: jnp.asarray(reset.condition(t, y, args), jnp.result_type(t))
     numbers = (eqx.filter(a, _is_number) for a in (new, args))
     after = jax.tree.map(lambda x, like: jnp.asarray(x, jnp.result_type(like)), *numbers)
     before = of(y, args)
-    moved = of(consistent_after(system, t, y, args, None), args) - before
+    moved = of(consistent_after(system, t, y, args, None, raised), args) - before
     found, moved = lax.stop_gradient((jnp.abs(before), jnp.abs(moved)))
     other = jnp.any(jnp.stack([jnp.any(a != b) for a, b in zip(*map(jax.tree.leaves, (wanted, y)), strict=True)]))
     return consistent, after, other.astype(found.dtype), found, moved
