@@ -21,7 +21,7 @@ from ..types import State, Time, TreeDef, Y
 
 _T = TypeVar("_T")
 # The constraints' linearisation at a point, in the form that its equations keep it in.
-ConstraintJacobian: TypeAlias = Array | tuple[Array, ...]
+ConstraintJacobian: TypeAlias = Array | tuple[Any, ...]
 # What is added to the highest derivative of a constraint, of the constraint and its lower derivatives.
 Feedback: TypeAlias = Callable[..., Array]
 
