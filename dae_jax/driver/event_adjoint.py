@@ -75,9 +75,9 @@ def at_event(
     t: Time,
     y: Y,
     of_t: Scalar,
-) -> tuple[Any, Scalar, Any]:
+) -> tuple[Any, Any]:
     """What the cotangent `of_t` of the time at which an event has ended a solve, at (t, y), is for its condition's numbers and for y;
-    and what is left of it: all of it where no event did, of which there are several. That of a flag is the end of a step, which stays.
+    nothing where no event did, of which there are several. The time of a flag is the end of a step, which stays.
     """
     real: list[bool] = []
 
@@ -94,4 +94,4 @@ def at_event(
     counts = (event >= 0) & jnp.array(real)[event] & (of_t != 0)
     factor = -of_t / jnp.where(counts, rate, 1)
     moved = functools.partial(jax.tree.map, lambda x: jnp.where(counts, factor.astype(x.dtype) * x, 0))
-    return moved(of_numbers), jnp.where(event >= 0, 0, of_t), moved(of_y)
+    return moved(of_numbers), moved(of_y)

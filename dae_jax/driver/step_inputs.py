@@ -33,7 +33,7 @@ class StepInputs(NamedTuple):
     y: Any
     ode: Any
     view: Any
-    # Of events.
+    # Of events whose times are looked for; that of others is the end of a step.
     conditions: Any
 
     @classmethod
@@ -49,7 +49,8 @@ class StepInputs(NamedTuple):
         if stop is not None:
             assert isinstance(solve.event, diffrax.Event)
             direction, given = jnp.where(t1 < t0, -1, 1), known_to_conditions(solve, problem)
-            conditions = conditions_of(solve.event, decode, problem.args, direction, given)
+            if solve.event.root_finder is not None:
+                conditions = conditions_of(solve.event, decode, problem.args, direction, given)
             t1 = jnp.where(stop.event >= 0, stop.time, t1)
         view = View(part.fn, decode, problem.args)
         return cls(solve.formulation, solver, part, t0, t1, problem.dt0, y, ode, view, conditions)

@@ -212,8 +212,10 @@ def cotangents(
         end = jnp.where(_is_zero(of_last), end, last - 1)
     if stop is not None:
         end = jnp.where(of_t1 == 0, end, last - 1)
-        more_numbers, of_t1, more_y = at_event(stop.event, values, numbers, inputs.t1, _entry(points, last), of_t1)
-        of_numbers, of_y = _sum(of_numbers, more_numbers), _sum(of_y, more_y)
+        if inputs.conditions is not None:
+            more_numbers, more_y = at_event(stop.event, values, numbers, inputs.t1, _entry(points, last), of_t1)
+            of_numbers, of_y = _sum(of_numbers, more_numbers), _sum(of_y, more_y)
+        of_t1 = jnp.where(stop.event >= 0, 0, of_t1)
     carry = (end, last_saved, of_y, _zeros(begin), of_numbers, zero, of_t1, jnp.zeros_like(save_times))
     _, _, of_y, of_begin, of_numbers, of_t0, of_t1, of_times = lax.while_loop(
         lambda carry: carry[0] >= 0, one_step, carry

@@ -92,8 +92,7 @@ def test_second_derivatives(name):
     np.testing.assert_allclose(found, jax.hessian(of(exact))(x), atol=1e4 * TOLERANCE)
 
 
-def test_backwards_and_a_flag():
-    """A flag ends a solve at the end of a step, whose time has no derivative."""
+def test_backwards():
     back = lambda p: dae_jax.daesolve(
         FALL, METHODS["projection"][0], 1.0, -1.0, None,
         (jnp.stack([0 * p["h"], p["h"]]), jnp.stack([0 * p["h"], p["v"]])), p,
@@ -107,11 +106,22 @@ def test_backwards_and_a_flag():
     for name, value in jax.grad(when)(P).items():
         np.testing.assert_allclose(found[name], value, atol=200 * TOLERANCE)
 
+
+FLAGS = {
+    "flag": diffrax.Event(lambda t, y, p, **_: y[0][1] < 0.5),
+    "not looked for": diffrax.Event(lambda t, y, p, **_: y[0][1] - 0.5),
+}
+
+
+@pytest.mark.parametrize("kind", FLAGS)
+def test_at_the_end_of_a_step(kind):
+    """Whose time has no derivative."""
+
     def flagged(p):
         sol = dae_jax.daesolve(
             FALL, METHODS["projection"][0], 0.0, 2.0, 0.1,
             (jnp.stack([0 * p["h"], p["h"]]), jnp.stack([0 * p["h"], p["v"]])), p,
-            event=diffrax.Event(lambda t, y, p, **_: y[0][1] < 0.5), max_steps=100,
+            event=FLAGS[kind], max_steps=100,
             stepsize_controller=diffrax.PIDController(TOLERANCE, TOLERANCE),
         )  # fmt: skip
         return sol.ts[-1], sol.ys[0][-1, 1]
