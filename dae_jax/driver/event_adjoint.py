@@ -13,9 +13,13 @@ import jax.numpy as jnp
 from jaxtyping import PyTree
 
 from ..compiler.types import Arrays
-from ..types import IntScalar, Scalar, Time, Y
+from ..types import BoolScalar, IntScalar, Scalar, Time, Y
 from .crossings import OnStates
-from .followed_steps import Steps, Stop, of_bits
+from .followed_steps import Steps, Stop, as_bits, of_bits
+
+
+# The last step of a derivative may end so much before an event, as a part of the interval, or by as much as it is long.
+NEAR = 1e-3
 
 
 def conditions_of(event: diffrax.Event, decode: Any, args: Any, direction: Scalar, given: dict[str, Any]) -> PyTree:
@@ -29,6 +33,16 @@ def stop_of(fields: tuple[Any, ...]) -> Stop:
     event_mask, (end, _) = fields[7], fields[9]
     mask = jnp.stack(jax.tree.leaves(event_mask))
     return Stop(end, jnp.where(jnp.any(mask), jnp.argmax(mask), -1).astype(jnp.int32))
+
+
+def stopped(steps: Steps, stop: Stop, backwards: BoolScalar) -> Steps:
+    """Steps of a derivative up to where the solution has `stop`ped; NaN where they have ended long before, by another event."""
+    numbers = of_bits(steps)
+    times, last = numbers.times, jnp.sum(jnp.isfinite(numbers.times)) - 1
+    end = jnp.where(backwards, -stop.time, stop.time)
+    allowed = times[last] - times[jnp.maximum(last - 1, 0)] + NEAR * (end - times[0])
+    lost = (stop.event >= 0) & (end - times[last] > allowed)
+    return as_bits(numbers._replace(times=jnp.where(lost, jnp.nan, times), stop=stop))
 
 
 def end_of(solved: Callable[[Arrays, Steps], Any], arrays: Arrays, steps: Steps) -> Scalar:

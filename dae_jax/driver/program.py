@@ -28,7 +28,7 @@ from .between_steps import Flow, has_flow
 from .changes import changing, some_changes, with_changes
 from .diffrax_call import call, failed, steps_of, took_steps
 from .ends import Start, look
-from .event_adjoint import stop_of
+from .event_adjoint import stop_of, stopped
 from .event_functions import known_to_conditions, refuse_wrong_event
 from .failures import refused_on_the_way
 from .felt_steps import OneDirection, by_felt_steps
@@ -260,7 +260,7 @@ class Solve:
             changes = as_kernel(changes_of, often=False)(arrays, end)
             found = as_kernel(steps)(arrays, changes, failed(out, problem))
             if self.event is not None:
-                found = as_bits(of_bits(found)._replace(stop=stop_of(jax.lax.stop_gradient(out.whole()))))
+                found = stopped(found, stop_of(jax.lax.stop_gradient(out.whole())), problem.t1 < problem.t0)
             return refused_on_the_way(found, most) if self.throw else found
 
         return way

@@ -8,6 +8,8 @@ import optimistix
 import pytest
 
 import dae_jax
+from dae_jax.driver.event_adjoint import stopped, up_to
+from dae_jax.driver.followed_steps import Steps, Stop, as_bits, of_bits
 from dae_jax.driver.program import Solve
 
 
@@ -129,6 +131,21 @@ def test_at_the_end_of_a_step(kind):
     (of_time, of_height), (end, _) = jax.jit(jax.jacrev(flagged))(P), flagged(P)
     np.testing.assert_array_equal(jax.tree.leaves(of_time), 0)
     np.testing.assert_allclose([of_height[k] for k in "hvg"], [1, end, -(end**2) / 2], atol=200 * TOLERANCE)
+
+
+def test_steps_of_a_derivative_end_where_the_solution_does():
+    """An event is earlier or later by them than by those of the solution, as far as its error goes; by another event they are lost."""
+    times = jnp.array([0.0, 0.5, 0.9, 1.4, jnp.inf, jnp.inf])
+    at = lambda end, event=0: of_bits(
+        stopped(as_bits(Steps(times, None)), Stop(jnp.asarray(end), jnp.asarray(event)), False)
+    )
+    ends = lambda end: up_to(as_bits(at(end)), jnp.asarray(end)).times
+    for end, expected in ((1.2, [0, 0.5, 0.9, 1.2]), (0.89, [0, 0.5, 0.89]), (1.41, [0, 0.5, 0.9, 1.41])):
+        found = ends(end)
+        np.testing.assert_array_equal(found[jnp.isfinite(found)], expected)
+    assert np.isnan(ends(2.0)).any()
+    # Of a solve that failed what was saved before has its derivative.
+    assert not np.isnan(at(2.0, event=-1).times).any()
 
 
 def test_the_trajectory_serves_events_but_not_every_one():
