@@ -245,7 +245,7 @@ class TestSingularConfiguration:
         sol = solve(system, solver, y0, t1=3.0, formulation=formulation, max_steps=1000, throw=False)
         assert sol.result == RESULTS.singular_configuration
         # The crank's pin is as far from the pivot as both rods are long.
-        np.testing.assert_allclose(1.5**2 + 2**2 - 6 * jnp.cos(sol.ts[-1] + 0.5), 4.0, atol=1e-6)
+        np.testing.assert_allclose(1.5**2 + 2**2 - 6 * jnp.cos(sol.end[0] + 0.5), 4.0, atol=1e-6)
 
     def test_dummy_derivatives_do_not_leap_over_a_dead_centre_that_is_nearly_one(self):
         """The rod is longer than the crank by 1e-12: where the crank is level the slider stops short of the other side."""
