@@ -121,7 +121,7 @@ def unsolved(system: System, t: Time, state: State, args: Args, way: tuple[State
     start, span = (y, jnp.zeros_like(t)) if way is None else (form.encode(way[0]), way[1])
     linearised = LinearisedResidual.of(form, y)
     if linearised.structure.hidden:
-        ode = StructuralODE.of(form, y.dtype, complete=True)
+        ode = StructuralODE.of(form, y.dtype, complete=1)
         return _left_over(ode, t, ode.encode(t, state), start, span)
     several = rates_of(form, t, y)[1] if is_nonlinear(form, y.dtype) else jnp.asarray(False)
     yd = linearised.ydot(t, y)

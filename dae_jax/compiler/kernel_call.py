@@ -22,6 +22,7 @@ from jaxtyping import Array, PyTree
 from . import fallbacks, lower, waiting, xla_kernel
 from ._compat import at_ease, dce_jaxpr, setting
 from .check import checked
+from .emit.target import Target
 from .jaxprs.expansions import expanded, kernel_written_out
 from .jaxprs.scalar_interpreter import Unsupported
 from .jaxprs.unchecked import checks_dropped
@@ -53,11 +54,7 @@ def decision(jaxpr: ClosedJaxpr, batched: Sequence[bool] = ()) -> Decision:
     except Unsupported as reason:
         return Decision("xla", (reason,))
     kept = tuple(b for b, u in zip(batched, used, strict=True) if u) if batched else ()
-    on_gpu = jax.default_backend() == "gpu"
-    found = _decided(kernel, kept, on_gpu)
-    if not found.unsupported or current().compiler != "llvm" or (on_gpu and gpu() is None):
-        return found
-    return dataclasses.replace(found, unsupported=lower.unsupported(kernel, kept, gpu() if on_gpu else None))
+    return _decided(kernel, kept, jax.default_backend() == "gpu", lower.unsupported)
 
 
 def unsupported(jaxpr: ClosedJaxpr) -> tuple[str, ...]:
@@ -72,16 +69,26 @@ def hindrances(jaxpr: ClosedJaxpr) -> tuple[str, ...]:
     return unsupported(jaxpr)
 
 
-def _decided(kernel: ClosedJaxpr, batched: tuple[bool, ...], on_gpu: bool = False) -> Decision:
+def _first(kernel: ClosedJaxpr, batched: tuple[bool, ...], target: Target | None) -> tuple[Unsupported, ...]:
+    judged = lower.annotate(kernel, batched, target)
+    return (judged,) if isinstance(judged, Unsupported) else ()
+
+
+def _decided(
+    kernel: ClosedJaxpr,
+    batched: tuple[bool, ...],
+    on_gpu: bool = False,
+    look: Callable[..., tuple[Unsupported, ...]] = _first,
+) -> Decision:
+    """`look`: finds the first of what our compiler does not take, or all of it."""
     if current().compiler != "llvm":
         found = (Unsupported(f"our compiler is switched off: `compiler={current().compiler!r}`"),)
     elif on_gpu and gpu() is None:
         found = (Unsupported("there is no GPU that kernels work on", primitive="system"),)
     else:
-        judged = lower.annotate(kernel, batched, gpu() if on_gpu else None)
-        if not isinstance(judged, Unsupported):
-            return Decision("llvm", ())
-        found = (judged,)
+        found = look(kernel, batched, gpu() if on_gpu else None)
+    if not found:
+        return Decision("llvm", ())
     # XLA's single kernels are the CPU's; which form of a batch it takes depends on its size.
     by_xla = not on_gpu and current().compiler != "off" and not xla_kernel.unsupported(kernel)
     return Decision("xla kernel" if by_xla else "xla", found)

@@ -1,6 +1,7 @@
 """A derivative that is no number is an error where the solution is one."""
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -36,15 +37,22 @@ def _checked(given: bool, numbers: PyTree[Array]) -> PyTree[Array]:  # noqa: ARG
 
 @_checked.defjvp
 def _(given: bool, primals: tuple[PyTree[Array]], tangents: tuple[PyTree[Array]]) -> tuple[PyTree, PyTree]:
-    # All as one array, as in reverse mode all of a linear system's right-hand sides must have a cotangent.
-    changes, as_before = ravel_pytree(tangents[0])
     finite, _ = ravel_pytree(jax.tree.map(jnp.isfinite, primals[0]))
-    as_it_is = lambda _, change: change
+    as_it_is = lambda change: change
 
-    def known(_: object, change: Float[Array, " n"]) -> Array:
+    def known(change: Float[Array, " n"]) -> Array:
         return refused_where(jnp.any(jnp.isnan(change) & finite), UNKNOWN, change)
 
-    forward, backward = (as_it_is, known) if given else (known, as_it_is)
-    # The identity as a linear system: the one way to give a function and its transpose, with batches and derivatives of both.
-    change = lax.custom_linear_solve(lambda changes: changes, changes, forward, backward)
-    return primals[0], as_before(change)
+    return primals[0], with_transpose(tangents[0], *((as_it_is, known) if given else (known, as_it_is)))
+
+
+def with_transpose(
+    changes: PyTree[Array], forward: Callable[[Array], Array], backward: Callable[[Array], Array]
+) -> Any:
+    """`forward` of all numbers of a tree as one vector, which is linear, with `backward` as its transpose, in batches and derivatives of
+    any order.
+    """
+    # As one array, as in reverse mode all of a linear system's right-hand sides must have a cotangent; as the identity's linear system,
+    # which is the one way to give both.
+    flat, as_before = ravel_pytree(changes)
+    return as_before(lax.custom_linear_solve(lambda x: x, flat, lambda _, x: forward(x), lambda _, x: backward(x)))

@@ -8,12 +8,12 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, PyTree
 
 from ..solution import DAESolution, last_saved, went_well
 from ..types import BoolScalar
+from .known_derivatives import with_transpose
 from .start import is_saved_part
 
 
@@ -66,15 +66,13 @@ def _with_derivatives(saved: PyTree[Array], given: list[Array]) -> PyTree[Array]
 def _(primals: tuple[PyTree, list[Array]], tangents: tuple[PyTree, list[Array]]) -> tuple[PyTree, PyTree]:
     saved, _ = primals
     change, of_given = tangents
-    # All as one array, as in reverse mode all of a linear system's right-hand sides must have a cotangent.
-    changes, as_before = ravel_pytree((change, sum(map(jnp.sum, of_given))))
     known, _ = ravel_pytree((jax.tree.map(jnp.isfinite, saved), True))
-    forward = lambda _, changes: jnp.where(known, changes, jnp.nan)
 
-    def backward(_: object, wanted: Array) -> Array:
+    def forward(changes: Array) -> Array:
+        return jnp.where(known, changes, jnp.nan)
+
+    def backward(wanted: Array) -> Array:
         lost = jnp.any(~known & (wanted != 0))
         return jnp.where(known, wanted, 0).at[-1].set(jnp.where(lost, jnp.nan, 0))
 
-    # The identity as a linear system: the one way to give a function and its transpose, with batches and derivatives of both.
-    change, _ = as_before(lax.custom_linear_solve(lambda changes: changes, changes, forward, backward))
-    return saved, change
+    return saved, with_transpose((change, sum(map(jnp.sum, of_given))), forward, backward)[0]

@@ -19,9 +19,9 @@ from jaxtyping import Array, Float, PyTree
 
 from .._compat import WrapTerm
 from ..equations.residual_form import LARGE
-from ..formulations import AbstractFieldFormulation
 from ..solvers import is_recomputable, replays
 from ..types import IntScalar, Scalar, Time, Y
+from .between_steps import has_flow
 from .crossings import OnStates
 from .event_adjoint import at_event
 from .followed_steps import Stop
@@ -44,20 +44,17 @@ def has_trajectory_adjoint(solve: "Solve", size: int) -> bool:
     numbers, largest = (solve.max_steps or 0) + 1, LARGEST_TRAJECTORY
     if size > LARGE:
         numbers, largest = numbers * (1 + getattr(solve.solver, "kept", 0)), LARGEST_OF_LARGE
+    # The end of a solve with events moves as the equations say, of which a form has up to eight times as many unknowns.
+    end_has_flow = has_flow(solve.formulation, jax.ShapeDtypeStruct((8 * size,), float))
     return (
         is_saved_part(part)
         and not (part.steps or saveat.dense or saveat.solver_state or saveat.controller_state or saveat.made_jump)
-        and (solve.event is None or (solve.has_steps_of_derivatives(size) and _has_flow(solve, size)))
+        and (solve.event is None or (solve.has_steps_of_derivatives(size) and end_has_flow))
         and type(solve.controller) in (diffrax.PIDController, diffrax.ConstantStepSize)
         and solve.max_steps is not None
         and numbers * size <= largest
         and (is_recomputable(solve.solver) or replays(solve.solver))
     )
-
-
-def _has_flow(solve: "Solve", size: int) -> bool:
-    """Whether the end moves with its time as the equations say, of which a form has up to eight times as many unknowns."""
-    return isinstance(solve.formulation, AbstractFieldFormulation) or 8 * size <= LARGE
 
 
 def recorded(stages: bool) -> diffrax.SaveAt:

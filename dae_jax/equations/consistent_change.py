@@ -39,7 +39,7 @@ def consistent_change(system: System, t: Time, y: State, change: State, args: Ar
     form = ResidualForm.of(system, t, y, args)
     values, wanted = form.encode(y), form.encode(change)
     t = jnp.asarray(t, values.dtype)
-    ode = StructuralODE.of(form, values.dtype, complete=True)
+    ode = StructuralODE.of(form, values.dtype, complete=1)
     at = ode.encode(t, y)
     is_value = ode.orders.values >= 0
     aim = jnp.where(is_value, take(wanted, ode.orders.values), 0)

@@ -37,7 +37,7 @@ def equation_drift(system: System, t: Time, state: State, args: Args) -> tuple[F
     linearised = LinearisedResidual.of(form, y)
     if not linearised.structure.hidden:
         return (jnp.max(jnp.abs(linearised.residual(t, y, linearised.ydot(t, y)))),)
-    ode = StructuralODE.of(form, y.dtype, complete=True)
+    ode = StructuralODE.of(form, y.dtype, complete=1)
     if ode.sparse is not None:
         # All levels at once: the derivatives with which they are least together.
         return tuple(jnp.max(jnp.abs(level)) for level in ode.invariants(t, ode.start(t, y, None)))

@@ -338,7 +338,7 @@ def test_sparse_invariants_are_the_dense_ones(name):
     """Also where equations stand for combinations of derivatives of others, as in the loop of capacitors."""
     scene = SCENES[name]()
     form = ResidualForm.of(scene.system, 0.0, scene.y0, scene.args)
-    ode = StructuralODE.of(form, jnp.float64, complete=True)
+    ode = StructuralODE.of(form, jnp.float64, complete=1)
     sparse = SparseInvariants.of(ode, find_offsets(form, jnp.float64).occurrence)
     y = jnp.asarray(np.random.default_rng(0).uniform(0.1, 1, ode.orders.size))
     dense = ode.jacobian(0.3, y)
