@@ -23,12 +23,17 @@ from . import fallbacks, lower, waiting, xla_kernel
 from ._compat import at_ease, dce_jaxpr, setting
 from .check import checked
 from .emit.target import Target
+from .jaxprs.equal_functions import content
 from .jaxprs.expansions import expanded, kernel_written_out
 from .jaxprs.scalar_interpreter import Unsupported
 from .jaxprs.unchecked import checks_dropped
 from .on_gpu import gpu
 from .settings import current
 
+
+# Functions that were traced last, by what they compute.
+KEPT = 8
+_last: dict[Any, tuple[ClosedJaxpr, ClosedJaxpr]] = {}
 
 kernel_p = Primitive("one_kernel")
 kernel_p.multiple_results = True
@@ -94,6 +99,7 @@ def _decided(
     return Decision("xla kernel" if by_xla else "xla", found)
 
 
+@functools.lru_cache(maxsize=KEPT)
 def _needed(jaxpr: ClosedJaxpr) -> tuple[ClosedJaxpr, list[bool]]:
     """A function as it is compiled to a kernel, and which of its arguments that has."""
     # Tangents of integers are no numbers. XLA aborts where a parameter of a kernel is not used.
@@ -124,7 +130,22 @@ def _traced(fn: Callable[..., Any], shapes: PyTree) -> tuple[ClosedJaxpr, Any]:
     """The jaxpr, and the tree of the results."""
     with without_mesh():
         jaxpr, out = jax.make_jaxpr(fn, return_shape=True)(*shapes)
-        return checks_dropped(jaxpr), jax.tree.structure(out)
+        return _recent(jaxpr), jax.tree.structure(out)
+
+
+def _recent(jaxpr: ClosedJaxpr) -> ClosedJaxpr:
+    """A traced function without the checks of its caller: the same object for those of the last that were equal, as which a solve within
+    a derivative is one with the solve alone: what is found of it is found once.
+    """
+    if any(isinstance(x, Tracer) for x in jaxpr.consts):
+        return checks_dropped(jaxpr)
+    key = content(jaxpr)
+    # What was traced is kept with it: its parts are known by where they are.
+    _, found = _last.pop(key, None) or (jaxpr, checks_dropped(jaxpr))
+    _last[key] = jaxpr, found
+    if len(_last) > KEPT:
+        del _last[next(iter(_last))]
+    return found
 
 
 def without_mesh() -> AbstractContextManager[Any]:

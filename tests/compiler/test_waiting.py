@@ -264,3 +264,35 @@ def test_passes_are_run_where_they_gain_more_than_they_take():
     assert not object_code._gains_by_passes(address * object_code.ADDRESSES)
     assert not object_code._gains_by_passes(loop * (object_code.LOOPS + 1))
     assert not object_code._gains_by_passes("\n" * object_code.HEAVY)
+
+
+def test_equal_functions_are_looked_into_once():
+    made_once = jax.jit(lambda x, scale: scale * jnp.sin(x))
+    shape = (jax.ShapeDtypeStruct((3,), float),)
+    first, _ = kernel_call._traced(lambda x: made_once(x, 2.0), shape)
+    assert kernel_call._traced(lambda y: made_once(y, 2.0), shape)[0] is first
+    assert kernel_call._traced(lambda x: made_once(x, 3.0), shape)[0] is not first
+    assert kernel_call._traced(lambda x: made_once(x, 2.0) + 0, shape)[0] is not first
+    assert kernel_call._traced(lambda x: made_once(x, 2.0), (jax.ShapeDtypeStruct((4,), float),))[0] is not first
+    shifted = [lambda x, c=c: made_once(x, 2.0) + c for c in (np.zeros(3), np.zeros(3), np.ones(3))]
+    zero, also_zero, one = (kernel_call._traced(fn, shape)[0] for fn in shifted)
+    assert zero is also_zero is not one
+
+
+def test_a_solve_within_another_program_is_looked_into_once():
+    force, constraint = (lambda t, q, v, a: jnp.array([0.0, -a])), lambda t, q, a: (q @ q - 1) / 2
+    system = dae_jax.ConstrainedSystem(force, constraint)
+    y0 = (jnp.array([1.0, 0.0]), jnp.zeros(2))
+
+    def height(a):
+        return dae_jax.daesolve(system, dae_jax.OrthogonalProjection(diffrax.Heun()), 0.0, 0.1, 0.01, y0, a).ys[0][
+            -1, 1
+        ]
+
+    height(9.81)
+    before = kernel_call._needed.cache_info()
+    jax.jit(height)(9.81)
+    after = kernel_call._needed.cache_info()
+    assert after.hits > before.hits
+    # What looks at its start and its end is traced anew.
+    assert after.misses - before.misses <= 1

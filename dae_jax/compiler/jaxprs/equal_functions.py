@@ -74,15 +74,21 @@ class EqualFunctions:
     def _first_run(self, closed: ClosedJaxpr) -> ClosedJaxpr:
         """The first of all that are equal to this one, of what loops and branches run."""
         found = self(closed)
-        jaxpr = found.jaxpr
-        eqns, _ = _in_order(jaxpr, jaxpr.outvars)
-        content = _content((*jaxpr.constvars, *jaxpr.invars), found.consts, eqns, jaxpr.outvars)
-        return self._first.setdefault(content, found)
+        return self._first.setdefault(content(found), found)
 
     def _first_called(self, closed: ClosedJaxpr) -> _Function:
         """The first of all functions that are equal to this one."""
-        found, content = _parted(self(closed))
-        return found._replace(closed=self._first.setdefault(content, found.closed))
+        found, of_function = _parted(self(closed))
+        return found._replace(closed=self._first.setdefault(of_function, found.closed))
+
+
+def content(closed: ClosedJaxpr) -> Hashable:
+    """What is the same of functions that compute the same in the same way, but for names and the order of equations, while they and what
+    they call are there.
+    """
+    jaxpr = closed.jaxpr
+    eqns, _ = _in_order(jaxpr, jaxpr.outvars)
+    return _content((*jaxpr.constvars, *jaxpr.invars), closed.consts, eqns, jaxpr.outvars)
 
 
 def _is_closed(x: object) -> bool:
@@ -115,8 +121,8 @@ def _parted(closed: ClosedJaxpr) -> tuple[_Function, Hashable]:
         jaxpr.replace(constvars=constvars, invars=invars, outvars=outvars, eqns=kept),
         [constant[v] for v in constvars],
     )
-    content = _content((*constvars, *invars), found.consts, eqns, outvars)
-    return _Function(found, [place[v] for v in invars], computed, given), content
+    of_function = _content((*constvars, *invars), found.consts, eqns, outvars)
+    return _Function(found, [place[v] for v in invars], computed, given), of_function
 
 
 def _in_order(jaxpr: Jaxpr, outvars: Iterable[Atom]) -> tuple[list[JaxprEqn], list[Var]]:

@@ -48,7 +48,7 @@ def unsupported(
     return tuple(_unsupported(inlined(without_keys(jaxpr)), inlined, target)) or (judged,)
 
 
-@functools.lru_cache(maxsize=4)
+@functools.lru_cache(maxsize=8)
 def _annotated(jaxpr: ClosedJaxpr, batched: tuple[bool, ...], target: Target) -> Annotated | Unsupported:
     whole, procedures = without_keys(jaxpr), frozenset()
     refused = _callback(whole, target)

@@ -26,7 +26,7 @@ def written(
     return _written(jaxpr, batched, always_copies, target or host())
 
 
-@functools.lru_cache(maxsize=2)
+@functools.lru_cache(maxsize=8)
 def _written(jaxpr: ClosedJaxpr, batched: tuple[bool, ...], always_copies: bool, target: Target) -> str:
     annotated = annotate(jaxpr, batched, target)
     if isinstance(annotated, Unsupported):
