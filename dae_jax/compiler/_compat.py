@@ -13,6 +13,8 @@ import jax
 import numpy as np
 from jax._src import xla_bridge
 from jax._src.core import eval_context as eval_context, trace_state_clean as trace_state_clean
+from jax._src.interpreters.partial_eval import lower_jaxpr2
+from jax.extend.core import ClosedJaxpr
 from jax.interpreters.partial_eval import dce_jaxpr as dce_jaxpr
 
 from .types import Aval, Equation, Params
@@ -85,6 +87,11 @@ def compilation_cache_folder() -> str | None:
     if not folder or "://" in folder or not jax.config.values["jax_enable_compilation_cache"]:
         return None
     return folder
+
+
+def low(closed: ClosedJaxpr) -> ClosedJaxpr:
+    """The same function without primitives that are made of others, as which JAX 0.12 has `searchsorted`."""
+    return lower_jaxpr2(closed) if getattr(closed, "is_high", False) else closed
 
 
 def scan_counts(params: Params) -> tuple[int, int]:

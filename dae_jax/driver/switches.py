@@ -14,6 +14,7 @@ from jax.core import eval_jaxpr
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
 
 from ..compiler import Moving
+from ..compiler._compat import low
 from ..compiler.jaxprs.inline import Inlining
 from ..compiler.jaxprs.walk import needed_for
 from ..compiler.types import Arrays, Atom
@@ -66,7 +67,7 @@ class SteppedOver(eqx.Module):
 def stepped_over(problem: Problem) -> SteppedOver | None:
     """What sees such steps in the solution of a problem; `None` where its equations do not switch with time alone."""
     t, states = problem.start[1], _states(problem)
-    flat = Inlining()(jax.make_jaxpr(lambda t, states: _values(problem, t, states))(t, states))
+    flat = Inlining()(low(jax.make_jaxpr(lambda t, states: _values(problem, t, states))(t, states)))
     every, found = _comparisons(flat)
     if not found:
         return None
@@ -91,7 +92,7 @@ def warn_of_moving_switches(program: Program, arrays: Arrays, moving: Moving) ->
     def values(arrays: Arrays, t: Scalar, states: Any) -> Any:
         return _values(program.whole(arrays)[1], t, states)
 
-    flat = Inlining()(jax.make_jaxpr(values)(arrays, problem.t0, _states(problem)))
+    flat = Inlining()(low(jax.make_jaxpr(values)(arrays, problem.t0, _states(problem))))
     marks = ["moving" if m else "" for m in moving], "time", ["state"] * (len(flat.jaxpr.invars) - len(arrays) - 1)
     for eqn, found in _marked(flat, jax.tree.leaves(marks)):
         if found >= {"time", "moving"} and "state" not in found and eqn.primitive.name in _SWITCHES:

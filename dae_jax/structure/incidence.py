@@ -26,6 +26,7 @@ from jaxtyping import Float, PyTree
 from scipy.sparse import csr_array
 
 from ..compiler import ALL_CALLS, WITH_DERIVATIVE, called
+from ..compiler._compat import low
 from ..compiler.types import Aval, Equation, aval_of
 from . import (
     incidence_contractions as contractions,
@@ -126,7 +127,7 @@ def interpreted(fn: Callable[..., Any], *example_args: PyTree, derivative: bool 
     """
     leaves, treedef = jax.tree.flatten(example_args)
     avals = [_aval(leaf) for leaf in leaves]
-    closed = jax.make_jaxpr(lambda *flat: fn(*jax.tree.unflatten(treedef, flat)))(*avals)
+    closed = low(jax.make_jaxpr(lambda *flat: fn(*jax.tree.unflatten(treedef, flat)))(*avals))
     sizes = [math.prod(aval.shape) for aval in avals]
     sets = Sets(sum(sizes), slopes_only=derivative)
     inputs, start = [], 1

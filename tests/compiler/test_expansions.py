@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dae_jax.compiler import jit
+from dae_jax.compiler import equations, jit
+from dae_jax.compiler.jaxprs.expansions import expanded
 
 
 SIZES = [1, 2, 3, 6, 8]
@@ -46,6 +47,18 @@ def test_lu_and_what_is_made_of_it(n):
     assert_expanded(
         lambda a, b: (*jax.lax.linalg.lu(a), jnp.linalg.solve(a, b), jnp.linalg.inv(a), jnp.linalg.det(a)), a, b
     )
+
+
+def test_in_loops_and_branches():
+    square = lambda x: jnp.linalg.cholesky(x @ x.T + jnp.eye(3))
+
+    def fn(a):
+        turned = jax.lax.fori_loop(0, jnp.int32(a[0, 0]), lambda _, x: square(x), a)
+        return jax.lax.cond(a[0, 0] > 0, lambda x: jax.lax.map(square, x[None])[0], lambda x: x, turned)
+
+    a = 4 * np.eye(3) + matrix(3, 3)
+    assert_expanded(fn, a)
+    assert "cholesky" not in {eqn.primitive.name for eqn in equations(expanded(jax.make_jaxpr(fn)(a)))}
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

@@ -7,6 +7,7 @@ import pytest
 from jax._src.lax import lax as lax_total
 from jax.extend.random import threefry2x32_p
 
+from dae_jax.compiler import unsupported
 from dae_jax.compiler.lower import annotate, compiled
 
 
@@ -129,6 +130,22 @@ def test_running_totals(axis, reverse):
     same(fn, *numbers)
     numbers[0][:, 0], numbers[1][:, 7] = -np.inf, np.inf
     same(of_logarithms, *numbers, ulps=30, atol=1e-15)
+
+
+def test_what_is_a_primitive_in_some_versions_only():
+    """As `einsum` and `searchsorted` are from JAX 0.12 on, and made of others before."""
+    a = np.random.default_rng(1).normal(size=(3, 3))
+
+    def fn(x):
+        fraction, power = jnp.frexp(x)
+        places = jnp.nonzero(x > 0, size=3, fill_value=0)[0]
+        products = jnp.einsum("ij,j,k->ik", a, x, x), jnp.einsum("i,i->", x, x), jnp.einsum("ij,jk,k->i", a, a, x)
+        return [*products, fraction, power, jnp.ldexp(fraction, power + 1), x[places]]
+
+    x = np.random.default_rng(0).normal(size=(LANES, 3))
+    same(fn, x, ulps=64)
+    jaxpr = jax.make_jaxpr(jax.vmap(jax.grad(lambda x: sum(jnp.sum(y) for y in fn(x) if y.dtype == float))))(x)
+    assert not unsupported(jaxpr)
 
 
 def test_tables_of_any_size():

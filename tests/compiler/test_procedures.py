@@ -9,6 +9,7 @@ import pytest
 
 from dae_jax import compiler
 from dae_jax.compiler.jaxprs.equal_functions import EqualFunctions
+from dae_jax.compiler.jaxprs.walk import called
 from dae_jax.compiler.lower import compiled, written
 from dae_jax.compiler.lower.repeated import repeated
 from dae_jax.compiler.thresholds import THRESHOLDS
@@ -129,7 +130,7 @@ def functions_of(*fns):
     """How many different functions are called by one that calls them all."""
     call_all = lambda x, y: [jax.jit(fn)(x, y) for fn in fns]
     found = EqualFunctions()(jax.make_jaxpr(call_all)(X, X + 1))
-    calls = [eqn for eqn in found.jaxpr.eqns if eqn.primitive.name == "closed_call"]
+    calls = [eqn for eqn in found.jaxpr.eqns if called(eqn) is not None]
     assert len(calls) == len(fns)
     for a, b in zip(jax.core.eval_jaxpr(found.jaxpr, found.consts, X, X + 1), call_all(X, X + 1), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-13)

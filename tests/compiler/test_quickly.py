@@ -79,5 +79,6 @@ def test_only_of_few_numbers_are_optimisations_left_out(options_of, monkeypatch)
 def test_an_option_that_this_version_does_not_know_is_left_out():
     known = ("xla_backend_optimization_level", 0)
     assert accepted_options((known, ("xla_no_such_option", 1))) == dict([known])
-    # What a new version of XLA drops is to be looked at.
-    assert accepted_options(quickly._QUICK) == dict(quickly._QUICK)
+    # What a new version of XLA drops is to be looked at: JAX 0.12 has one kind of fusion only.
+    dropped = {"xla_cpu_use_fusion_emitters"} if jax.__version_info__ >= (0, 12) else set()
+    assert accepted_options(quickly._QUICK) == {k: v for k, v in quickly._QUICK if k not in dropped}

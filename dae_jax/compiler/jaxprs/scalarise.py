@@ -21,6 +21,7 @@ from jax.extend.core import jaxpr_as_fun
 from jax.typing import ArrayLike
 from jaxtyping import Array, PyTree
 
+from .._compat import low
 from ..types import Aval, Equation
 from .objects import is_number, objects
 from .scalar_interpreter import ScalarInterpreter, Unsupported
@@ -54,7 +55,7 @@ def scalarise(fn: Callable[..., Any], limit: int = LIMIT) -> Callable[..., Any]:
         shapes, out_tree = jax.tree.flatten(out)
 
         def as_scalars(*flat_leaves: Array) -> list[jax.Array]:
-            outputs = _Scalars(limit).run(jaxpr, [_scalars(leaf) for leaf in flat_leaves])
+            outputs = _Scalars(limit).run(low(jaxpr), [_scalars(leaf) for leaf in flat_leaves])
             return [_array(o, s) for o, s in zip(outputs, shapes, strict=True)]
 
         try:

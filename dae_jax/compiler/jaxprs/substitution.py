@@ -7,7 +7,7 @@ import jax
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
 
 from ..types import Atom, Equation
-from .walk import PLAIN, called, once_each
+from .walk import PLAIN, called, is_open, once_each
 
 
 class Substitution:
@@ -51,7 +51,7 @@ class Substitution:
             return self(inner)
         inner = called(eqn)
         # Constants of what takes its place are nowhere to be kept in a jaxpr that is not closed.
-        if inner is None or not any(isinstance(p, Jaxpr) for p in eqn.params.values()) or not self._enters(eqn):
+        if inner is None or not any(map(is_open, eqn.params.values())) or not self._enters(eqn):
             return None
         found = self(inner)
         return None if found is inner else found
@@ -65,7 +65,7 @@ class Substitution:
 
     def _within(self, param: Any) -> Any:
         """A parameter with what it holds substituted; itself where that is nothing."""
-        if type(param) in PLAIN or isinstance(param, Jaxpr):
+        if type(param) in PLAIN or is_open(param):
             return param
         if isinstance(param, ClosedJaxpr):
             return self(param)

@@ -24,6 +24,7 @@ LARGE = 4000
 CALLS = {
     "checkpoint": "jaxpr",
     "closed_call": "call_jaxpr",
+    "eval_jaxpr": "call_jaxpr",
     "jit": "jaxpr",
     "pjit": "jaxpr",
     "remat2": "jaxpr",
@@ -78,6 +79,11 @@ def held_by(eqn: Equation) -> Iterator[ClosedJaxpr | Jaxpr]:
     for param in eqn.params.values():
         if type(param) not in PLAIN:
             yield from jaxprs_in(param)
+
+
+def is_open(x: object) -> bool:
+    """Whether a parameter is a jaxpr that has no constants of its own; from JAX 0.12 on all have."""
+    return isinstance(x, Jaxpr) and not isinstance(x, ClosedJaxpr)
 
 
 def closed_in(eqn: Equation) -> Iterator[ClosedJaxpr]:

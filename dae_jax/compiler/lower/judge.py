@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr
 
+from .._compat import low
 from ..emit import available
 from ..emit.target import Target, host
 from ..jaxprs.equal_functions import EqualFunctions
@@ -45,12 +46,12 @@ def unsupported(
         return ()
     if judged.primitive == "size":
         return (judged,)
-    return tuple(_unsupported(inlined(without_keys(jaxpr)), inlined, target)) or (judged,)
+    return tuple(_unsupported(inlined(without_keys(low(jaxpr))), inlined, target)) or (judged,)
 
 
 @functools.lru_cache(maxsize=8)
 def _annotated(jaxpr: ClosedJaxpr, batched: tuple[bool, ...], target: Target) -> Annotated | Unsupported:
-    whole, procedures = without_keys(jaxpr), frozenset()
+    whole, procedures = without_keys(low(jaxpr)), frozenset()
     refused = _callback(whole, target)
     if refused is not None:
         return refused

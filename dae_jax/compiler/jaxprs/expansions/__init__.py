@@ -14,6 +14,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array
 
+from ..._compat import low
 from ...types import DType, Equation
 from ..special_functions import by_simpler_ones
 from ..substitution import Substitution
@@ -76,4 +77,4 @@ def expanded(closed: ClosedJaxpr, checks: bool = True) -> ClosedJaxpr:
         inner = jax.make_jaxpr(fn)(*(v.aval for v in eqn.invars))
         return inner if checks else checks_dropped(inner)
 
-    return Substitution(simpler)(closed)
+    return Substitution(simpler)(low(closed))
