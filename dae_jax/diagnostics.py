@@ -58,7 +58,8 @@ def drift(system: System, sol: DAESolution) -> Drift | EquationDrift:
 
     Of a `ConstrainedSystem`, a `Drift`. Of other systems an `EquationDrift`: `levels[0]` is the largest of |F| at each saved
     time, for the ẏ with which F(t, y, ẏ) = 0 holds best, so of algebraic equations what they are off by; `levels[k]` the
-    largest of the k-th derivatives of F that restrict y, the hidden constraints.
+    largest of the k-th derivatives of F that restrict y, the hidden constraints. Beyond the last saved time, where `sol.ts` is
+    infinite, it is what it was there, as are `energy` and `multipliers`.
 
     Errors: `ValueError` for a solution without saved states.
     """

@@ -29,7 +29,8 @@ class Mechanism(eqx.Module):
 
     Its states are pairs (q, v) of `Coordinates` and their derivatives: q["crank"] is (x, y, φ) of a body in the plane, and
     (x, y, z, e₀, e₁, e₂, e₃) in space, see `Body`. It is a pytree whose leaves are masses, inertias, points, stiffnesses and so
-    on: `jax.grad` and `jax.vmap` go through a function that makes a mechanism from a design and solves it.
+    on: `jax.grad` and `jax.vmap` go through a function that makes a mechanism from a design and solves it. What is shown of a
+    solution is an array over its saved times, in which the last value goes on beyond the end of a solve that stopped early.
 
     **Arguments**
 

@@ -142,11 +142,11 @@ def power(mechanism: "Mechanism", sol: DAESolution) -> dict[str, Float[Array, " 
 def _reaction(what: Any, t: Time, y: Any, lam: Array, mu: Array, args: Args, axes: str) -> tuple[Array, Array]:
     (mechanism, joint), (q, v) = what, y
     at = mechanism.configuration(q, v)
-    _, pull = jax.vjp(lambda q: joint.constraint(t, mechanism.configuration(q), args), q)
-    _, pull_v = jax.vjp(lambda v: joint.nonholonomic(t, mechanism.configuration(q, v), args), v)
+    held = _pull(lambda q: joint.constraint(t, mechanism.configuration(q), args), q, lam)
+    rolled = _pull(lambda v: joint.nonholonomic(t, mechanism.configuration(q, v), args), v, mu)
     # Of a joint on the ground, the ground is what the first body acts on.
     on, sign = (joint.on_b, 1.0) if joint.on_b.body != GROUND else (joint.on_a, -1.0)
-    generalised = -pull(lam)[0][on.body] - pull_v(mu)[0][on.body]
+    generalised = -held[on.body] - rolled[on.body]
     force, torque = wrench(q[on.body], generalised)
     arm = joint.on_b.position(at) - at.pose(on.body).position
     force, torque = sign * force, sign * (torque - moment(arm, force))
@@ -159,8 +159,14 @@ def _reaction(what: Any, t: Time, y: Any, lam: Array, mu: Array, args: Args, axe
 def _leading_work(what: Any, t: Time, y: tuple[Coordinates, Coordinates], lam: Array, args: Args) -> Array:
     """−λ·(∂l/∂q) v, of what leads by l(t, q) = 0."""
     (mechanism, joint), (q, v) = what, y
-    _, pull = jax.vjp(lambda q: joint.constraint(t, mechanism.configuration(q), args), q)
-    return -jnp.sum(pull(lam)[0].values * v.values)
+    pull = _pull(lambda q: joint.constraint(t, mechanism.configuration(q), args), q, lam)
+    return -jnp.sum(pull.values * v.values)
+
+
+def _pull(equations: Callable[[Coordinates], Array], at: Coordinates, multipliers: Array) -> Coordinates:
+    """(∂e/∂x)ᵀ λ of equations e(x); these have more digits than x and λ where the mechanism's numbers do."""
+    e, pull = jax.vjp(equations, at)
+    return pull(multipliers.astype(e.dtype))[0]
 
 
 def _work(load: AbstractLoad, t: Time, at: Configuration, args: Args) -> Array:

@@ -1,5 +1,7 @@
 """The rows of a state go with a mechanism's bodies: states of other bodies, or in another order, never pass as its own."""
 
+import dataclasses
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -192,3 +194,17 @@ def test_what_a_load_acts_along_may_have_a_value():
         place, speed = np.asarray(q["heavy"][:2]) - (0, 1), np.asarray(v["heavy"][:2])
         np.testing.assert_allclose(np.linalg.norm(place), 1.5, rtol=1e-12)
         np.testing.assert_allclose(place @ speed / 1.5, 0.4, rtol=1e-12)
+
+
+def test_what_is_shown_of_states_in_float32_has_their_digits():
+    drive = m.motor(JOINTS[0], motion=lambda t, args: 0.3 + 2 * t, name="drive")
+    led = m.Mechanism(BODIES, JOINTS, [drive, m.gravity((0, -9.81))])
+    sol = solved(led, led.assemble(at={"k": 0.1}))
+    single = jax.tree.map(lambda x: x.astype(jnp.float32), (sol.ts, sol.ys))
+    rounded = dataclasses.replace(sol, ts=single[0], ys=single[1])
+    for show in (
+        lambda sol: led.reaction(sol, "h")[0],
+        lambda sol: led.power(sol)["drive"],
+        lambda sol: led.inverse_dynamics(sol, ["h"])["h"],
+    ):
+        np.testing.assert_allclose(show(rounded), show(sol), rtol=1e-5)
