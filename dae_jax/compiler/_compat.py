@@ -6,7 +6,7 @@ Beside it XLA's interface for foreign functions, which has a version (`emit/inte
 import contextlib
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ParamSpec, TypeVar
 
 import jax
@@ -14,8 +14,11 @@ import numpy as np
 from jax._src import xla_bridge
 from jax._src.core import eval_context as eval_context, trace_state_clean as trace_state_clean
 from jax._src.interpreters.partial_eval import lower_jaxpr2
+from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr
 from jax.interpreters.partial_eval import dce_jaxpr as dce_jaxpr
+from jax.sharding import NamedSharding, PartitionSpec
+from jaxtyping import Array
 
 from .types import Aval, Equation, Params
 
@@ -92,6 +95,21 @@ def compilation_cache_folder() -> str | None:
 def low(closed: ClosedJaxpr) -> ClosedJaxpr:
     """The same function without primitives that are made of others, as which JAX 0.12 has `searchsorted`."""
     return lower_jaxpr2(closed) if getattr(closed, "is_high", False) else closed
+
+
+def varying_alike(args: Sequence[Array]) -> list[Array]:
+    """Arguments of a primitive, which within `jax.shard_map` vary from device to device all of them if one does, and are said to."""
+    over = frozenset().union(*(jax.typeof(x).mat.varying for x in args))
+    lacks = (over - jax.typeof(x).mat.varying for x in args)
+    return [jax.lax.pcast(x, tuple(axes), to="varying") if axes else x for x, axes in zip(args, lacks, strict=True)]
+
+
+def as_varying(aval: ShapedArray, like: ShapedArray) -> ShapedArray:
+    """The type of a result, which varies from device to device as an argument does."""
+    if not like.mat.varying:
+        return aval
+    whole = NamedSharding(like.sharding.mesh, PartitionSpec(*[None] * aval.ndim))
+    return aval.update(sharding=whole, manual_axis_type=like.mat)
 
 
 def scan_counts(params: Params) -> tuple[int, int]:

@@ -20,7 +20,7 @@ from jax.interpreters import batching, mlir
 from jaxtyping import Array, PyTree
 
 from . import fallbacks, lower, waiting, xla_kernel
-from ._compat import at_ease, dce_jaxpr, setting
+from ._compat import as_varying, at_ease, dce_jaxpr, setting, varying_alike
 from .check import checked
 from .emit.target import Target
 from .jaxprs.equal_functions import content
@@ -172,7 +172,7 @@ def called(jaxpr: ClosedJaxpr, args: Sequence[Array], often: bool = True) -> lis
 
 
 def _bind(jaxpr: ClosedJaxpr, batched: tuple[bool, ...], args: Sequence[Array], often: bool) -> list[Any]:
-    return kernel_p.bind(*args, jaxpr=jaxpr, batched=batched, often=often)
+    return kernel_p.bind(*varying_alike(args), jaxpr=jaxpr, batched=batched, often=often)
 
 
 @kernel_p.def_impl
@@ -184,9 +184,10 @@ def _(*args: Array, **params: Any) -> Any:
 
 
 @kernel_p.def_abstract_eval
-def _(*args: Array, jaxpr: ClosedJaxpr, batched: tuple[bool, ...], **_: bool) -> Any:
+def _(*args: Any, jaxpr: ClosedJaxpr, batched: tuple[bool, ...], **_: bool) -> Any:
     lead = next(((x.shape[0],) for x, b in zip(args, batched or [False] * len(args), strict=True) if b), ())
-    return [v.aval.update(shape=(*lead, *v.aval.shape)) for v in jaxpr.jaxpr.outvars]
+    found = [v.aval.update(shape=(*lead, *v.aval.shape)) for v in jaxpr.jaxpr.outvars]
+    return [as_varying(aval, args[0]) for aval in found] if args else found
 
 
 @at_ease

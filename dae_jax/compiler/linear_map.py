@@ -14,12 +14,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.core import ShapedArray
+from jax.custom_derivatives import zero_from_primal
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from ._compat import at_ease
+from ._compat import as_varying, at_ease, varying_alike
 from .kernel_call import as_kernel
 
 
@@ -48,7 +49,7 @@ class LinearMap:
     def __call__(self, at: Sequence[Array], x: Sequence[Array], shapes: Sequence[Array | ShapedArray]) -> Arrays:
         """A(at) x, whose arrays have the shapes and types of these."""
         avals = tuple(ShapedArray(jnp.shape(s), jnp.result_type(s)) for s in shapes)
-        return linear_p.bind(*at, *x, of=self, avals=avals)
+        return linear_p.bind(*varying_alike([*at, *x]), of=self, avals=avals)
 
 
 @jax.custom_batching.custom_vmap
@@ -68,6 +69,11 @@ def _(size: int, batched: Sequence[bool], *xs: Array) -> Any:
 def is_inexact(x: ArrayLike) -> bool:
     """Whether an array has derivatives."""
     return jnp.issubdtype(jnp.result_type(x), jnp.inexact)
+
+
+def no_tangent(y: Any) -> Any:
+    """The tangent of what has no derivative, in a rule for one."""
+    return zero_from_primal(y, symbolic_zeros=True)
 
 
 def of_moving(fn: Callable[[Arrays], Any], at: Arrays, moving: Sequence[bool]) -> tuple[Callable[..., Any], Arrays]:
@@ -160,7 +166,7 @@ def _evaluate(*args: Array, of: LinearMap, **_: object) -> Arrays:
 
 
 linear_p.def_impl(_evaluate)
-linear_p.def_abstract_eval(lambda *_, avals, **__: list(avals))
+linear_p.def_abstract_eval(lambda *args, avals, **_: [as_varying(aval, args[0]) for aval in avals])
 mlir.register_lowering(linear_p, mlir.lower_fun(_evaluate, multiple_results=True))
 
 

@@ -197,7 +197,12 @@ def _passed(
     start: PyTree[Array],
 ) -> Any:
     shapes = jax.eval_shape(lambda: arrays)
-    fail = lambda: jax.pure_callback(_raise_of, shapes, find(start), *details, vmap_method="expand_dims")
+
+    def fail() -> Any:
+        raised = jax.pure_callback(_raise_of, shapes, find(start), *details, vmap_method="expand_dims")
+        # Within `jax.shard_map` they vary from device to device as the arrays do.
+        return jax.tree.map(lambda x, of: jnp.where(True, x, of), raised, arrays)
+
     return lax.cond(unvmap_any(failed), fail, lambda: arrays)
 
 
