@@ -100,9 +100,10 @@ def daesolve(
       has the tolerance of the velocities along its constraint, a derivative ẏ, ÿ, … that is integrated that of y; what is absolute of
       both, in a mechanism, over the time τ in which the velocities' tolerance makes the positions', atol(q) / atol(v), ẍ over τ².
     - `saveat`, `adjoint`, `event`, `max_steps`, `throw`, `progress_meter`: as in diffrax. Functions in `saveat` and `event` get the state
-      in the structure of `y0`, and the user's `args`. A `diffrax.Event` ends the solve where its condition is zero if it has a root finder,
-      `diffrax.Event(condition, optimistix.Bisection(1e-9, 1e-9, flip="detect"))`, else at the end of the step in which that changes its
-      sign. With a `Reset` as `event` the solve goes on after it. Derivatives are those of the numerical solution: where steps leap over a
+      in the structure of `y0`, and the user's `args`. Of a time in `jump_ts` the state after the jump is saved, in the direction of the
+      solve; dense output has both (`sol.evaluate(t, left=False)`). A `diffrax.Event` ends the solve where its condition is zero if it has
+      a root finder, `diffrax.Event(condition, optimistix.Bisection(1e-9, 1e-9, flip="detect"))`, else at the end of the step in which
+      that changes its sign. With a `Reset` as `event` the solve goes on after it. Derivatives are those of the numerical solution: where steps leap over a
       kink of a function (`abs`, `where`, `sort`) they are right to about the square root of the tolerance; make its time known (`jump_ts`),
       or a `Reset` of it. Where it jumps at a time that depends on what is differentiated, they have that dependence where that time is
       given in `jump_ts` as it depends on it (`jump_ts=jnp.stack([args.switch])`), or is that of a `Reset`; else they lack it, as the
