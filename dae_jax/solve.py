@@ -103,18 +103,18 @@ def daesolve(
       in the structure of `y0`, and the user's `args`. Of a time in `jump_ts` the state after the jump is saved, in the direction of the
       solve; dense output has both (`sol.evaluate(t, left=False)`). A `diffrax.Event` ends the solve where its condition is zero if it has
       a root finder, `diffrax.Event(condition, optimistix.Bisection(1e-9, 1e-9, flip="detect"))`, else at the end of the step in which
-      that changes its sign. With a `Reset` as `event` the solve goes on after it. Derivatives are those of the numerical solution: where steps leap over a
-      kink of a function (`abs`, `where`, `sort`) they are right to about the square root of the tolerance; make its time known (`jump_ts`),
-      or a `Reset` of it. Where it jumps at a time that depends on what is differentiated, they have that dependence where that time is
-      given in `jump_ts` as it depends on it (`jump_ts=jnp.stack([args.switch])`), or is that of a `Reset`; else they lack it, as the
-      derivative of `where` does, and an `AccuracyWarning` says so where the time is compared with what depends on that. Steps of a
-      derivative are its own, with an error of up to ten tolerances relative to its largest entry, of changes of the start and of a
-      hundredth of all parameters together: about an equilibrium the solution itself allows any step. `max_steps` holds for them too, beyond
-      which it is an error to ask for the derivative (with `throw=False` it is NaN), after solvers of residuals have tried steps for changes
-      of the start alone. They are those of the solution, and may leap over what the derivative needs (give `dtmax` of the controller), with
-      `adjoint=DirectAdjoint()`, without one kernel, with `SaveAt(dense=True)` or `steps=True`, with `max_steps=None` or many unknowns, and
-      through a `custom_vjp`. Second derivatives are there in any order of modes, third ones with `jax.jacfwd` outside; with a progress
-      meter or without one kernel forward-mode derivatives need `adjoint=diffrax.ForwardMode()`.
+      that changes its sign. With a `Reset` as `event` the solve goes on after it. Derivatives are those of the numerical solution: where
+      steps leap over a kink of a function (`abs`, `where`, `sort`) they are right to about the square root of the tolerance; make its
+      time known (`jump_ts`), or a `Reset` of it. Where it jumps at a time that depends on what is differentiated, they have that
+      dependence where that time is given in `jump_ts` as it depends on it (`jump_ts=jnp.stack([args.switch])`), or is that of a `Reset`;
+      else they lack it, as the derivative of `where` does, and an `AccuracyWarning` says so where the time is compared with what depends
+      on that. Steps of a derivative are its own, with an error of up to ten tolerances relative to its largest entry, of changes of the
+      start and of a hundredth of all parameters together: about an equilibrium the solution itself allows any step. `max_steps` holds for
+      them too, beyond which it is an error to ask for the derivative (with `throw=False` it is NaN), after solvers of residuals have
+      tried steps for changes of the start alone. They are those of the solution, and may leap over what the derivative needs (give
+      `dtmax` of the controller), with `adjoint=DirectAdjoint()`, without one kernel, with `SaveAt(dense=True)` or `steps=True`, with
+      `max_steps=None` or many unknowns, and through a `custom_vjp`. Second derivatives are there in any order of modes, third ones with
+      `jax.jacfwd` outside; with a progress meter or without one kernel forward-mode derivatives need `adjoint=diffrax.ForwardMode()`.
 
     **Returns** a `DAESolution`.
 
