@@ -4,6 +4,7 @@ What the kernel is made with is decided when the program that calls it is compil
 our own compiler where it can, else XLA's single kernels, else XLA as it is. A batch becomes lanes of vectors.
 """
 
+import collections
 import dataclasses
 import functools
 import warnings
@@ -31,9 +32,9 @@ from .on_gpu import gpu
 from .settings import current
 
 
-# Functions that were traced last, by what they compute.
+# Functions that were traced last, by what they compute; in any thread.
 KEPT = 8
-_last: dict[Any, tuple[ClosedJaxpr, ClosedJaxpr]] = {}
+_last: collections.OrderedDict[Any, tuple[ClosedJaxpr, ClosedJaxpr]] = collections.OrderedDict()
 
 kernel_p = Primitive("one_kernel")
 kernel_p.multiple_results = True
@@ -140,11 +141,11 @@ def _recent(jaxpr: ClosedJaxpr) -> ClosedJaxpr:
     if any(isinstance(x, Tracer) for x in jaxpr.consts):
         return checks_dropped(jaxpr)
     key = content(jaxpr)
-    # What was traced is kept with it: its parts are known by where they are.
-    _, found = _last.pop(key, None) or (jaxpr, checks_dropped(jaxpr))
-    _last[key] = jaxpr, found
-    if len(_last) > KEPT:
-        del _last[next(iter(_last))]
+    # What was traced first is kept: its parts are known by where they are.
+    traced, found = _last.pop(key, None) or (jaxpr, checks_dropped(jaxpr))
+    _last[key] = traced, found
+    while len(_last) > KEPT:
+        _last.popitem(last=False)
     return found
 
 
