@@ -7,6 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax
 from jax.core import Tracer, eval_jaxpr
+from jax.custom_derivatives import zero_from_primal
 from jax.extend.core import jaxpr_as_fun
 from jaxtyping import Array, PyTree
 
@@ -15,7 +16,7 @@ from .jaxprs.checks import checks_apart
 from .jaxprs.expansions import expanded
 from .jaxprs.scalar_interpreter import Unsupported
 from .kernel_call import called, without_mesh
-from .linear_map import Arrays, batched_alike, derivative_map, is_inexact, no_tangent
+from .linear_map import Arrays, batched_alike, derivative_map, is_inexact
 from .settings import Settings, current, one_kernel_enabled
 
 
@@ -150,7 +151,7 @@ def _differentiable(fn: Callable[..., Arrays]) -> Callable[..., Arrays]:
         known = list(filter(is_inexact, out))
         push = derivative_map(lambda at: fn(*at), list(map(is_inexact, xs)), moving, len(known), _kernel)
         found = iter(push(xs, [dx for dx, m in zip(dxs, moving, strict=True) if m], known))
-        return out, [next(found) if is_inexact(y) else no_tangent(y) for y in out]
+        return out, [next(found) if is_inexact(y) else zero_from_primal(y, symbolic_zeros=True) for y in out]
 
     return call
 

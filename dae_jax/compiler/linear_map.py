@@ -14,7 +14,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.core import ShapedArray
-from jax.custom_derivatives import zero_from_primal
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jax.typing import ArrayLike
@@ -69,11 +68,6 @@ def _(size: int, batched: Sequence[bool], *xs: Array) -> Any:
 def is_inexact(x: ArrayLike) -> bool:
     """Whether an array has derivatives."""
     return jnp.issubdtype(jnp.result_type(x), jnp.inexact)
-
-
-def no_tangent(y: Any) -> Any:
-    """The tangent of what has no derivative, in a rule for one."""
-    return zero_from_primal(y, symbolic_zeros=True)
 
 
 def of_moving(fn: Callable[[Arrays], Any], at: Arrays, moving: Sequence[bool]) -> tuple[Callable[..., Any], Arrays]:

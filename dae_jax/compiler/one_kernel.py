@@ -13,23 +13,12 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_derivatives import SymbolicZero
+from jax.custom_derivatives import SymbolicZero, zero_from_primal
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from .kernel_call import as_kernel
-from .linear_map import (
-    Arrays,
-    LinearMap,
-    Moving,
-    batched_alike,
-    either,
-    forward_map,
-    is_inexact,
-    moved,
-    no_tangent,
-    of_moving,
-)
+from .linear_map import Arrays, LinearMap, Moving, batched_alike, either, forward_map, is_inexact, moved, of_moving
 from .settings import one_kernel_enabled
 from .types import TreeDef
 
@@ -99,7 +88,7 @@ def _reverse(
             )
             push = _derivative(changes)(flags)
             found = iter(push(at, [dx for dx, m in zip(dxs, moving, strict=True) if m], inexact(ys)))
-            dys = [next(found) if is_inexact(y) else no_tangent(y) for y in ys]
+            dys = [next(found) if is_inexact(y) else zero_from_primal(y, symbolic_zeros=True) for y in ys]
             return out, jax.tree.unflatten(of_ys, dys)
 
         return solve(*leaves)

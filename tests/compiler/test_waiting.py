@@ -285,9 +285,8 @@ def test_a_solve_within_another_program_is_looked_into_once():
     y0 = (jnp.array([1.0, 0.0]), jnp.zeros(2))
 
     def height(a):
-        return dae_jax.daesolve(system, dae_jax.OrthogonalProjection(diffrax.Heun()), 0.0, 0.1, 0.01, y0, a).ys[0][
-            -1, 1
-        ]
+        sol = dae_jax.daesolve(system, dae_jax.OrthogonalProjection(diffrax.Heun()), 0.0, 0.1, 0.01, y0, a)
+        return sol.ys[0][-1, 1]
 
     height(9.81)
     before = kernel_call._needed.cache_info()
