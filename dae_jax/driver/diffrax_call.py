@@ -33,6 +33,7 @@ from .event_functions import known_to_conditions
 from .felt_steps import SMALL, OneDirection, felt_steps
 from .followed_formulas import KnownFormulas
 from .followed_steps import RecordedEnds, Steps, at_steps, taken
+from .no_length import Begin, moving_with_times
 from .observed_steps import Observer, observed
 from .passages import passages
 from .problem import Problem
@@ -85,17 +86,20 @@ class View(eqx.Module):
     def __call__(self, t: Time, y: Y, ode: Equations) -> Any:
         return self.fn(t, self.decode(t, y, ode), self.args)
 
+    def as_still(self) -> "View":
+        """The same of a point that moves with its time as the equations say."""
+        return dataclasses.replace(self, decode=dataclasses.replace(self.decode, still=True))
+
 
 def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[Any, ...]:
     """`diffrax.diffeqsolve` on what the formulation makes of the problem; the fields of its solution, the end, and its steps where
     they are needed. `steps`: those to take.
     """
     t0, t1, dt0, args = problem.t0, problem.t1, problem.dt0, problem.args
-    y, ode = solve.encoded(problem)
+    start, ode = solve.encoded(problem)
     event = cast(diffrax.Event | None, solve.event)
-    flow, still, jumps = solve.flow(), solve.is_still(y), jump_times(solve.controller)
-    if still:
-        y = held(y, t0, flow, ode)
+    flow, still, jumps = solve.flow(), solve.is_still(start), jump_times(solve.controller)
+    y = held(start, t0, flow, ode) if still else start
     decode = Decode(flow, solve.solver, still, jumps if solve.saveat.dense else None)
     solver = economical(solve.solver, solve.between())
     controller = in_integrated(_fitted(solve.controller), t0, y, ode, solve.formulation)
@@ -159,8 +163,13 @@ def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[
         path = solver.whole_path(path)
     interpolation = None if path is None else Interpolation.of(path, decode, ode)
     ts, ys = cast(Any, sol.ts), cast(Any, sol.ys)
+    if has_flow(solve.formulation, y):
+        begin = lambda fn: Begin(t0, start, flow, View(fn, decode, args).as_still(), ode)
+        is_all = (t0 == t1) & ~jnp.any(jnp.stack([jnp.asarray(False), *jax.tree.leaves(sol.event_mask)]))
+        ts["user"], ys["user"] = moving_with_times(solve.saveat.subs, ts["user"], ys["user"], begin, t1, is_all)
     end = jax.lax.stop_gradient(jax.tree.map(lambda x: x[-1], (ts["end"], ys["end"])))
-    stats = {**sol.stats, "end_time": ts["end"][-1]}
+    # Where there is no step diffrax has the end at t0.
+    stats = {**sol.stats, "end_time": jnp.where(t0 == t1, t1, ts["end"][-1])}
     starts = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(y)]))
     result = RESULTS.where(starts, RESULTS.promote(sol.result), RESULTS.no_finite_start)
     state: Any = sol.solver_state

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from ..solvers import economical
-from .between_steps import held
+from .between_steps import has_flow, held
 from .diffrax_call import Decode, View
 from .event_adjoint import conditions_of
 from .event_functions import known_to_conditions
@@ -42,9 +42,9 @@ class StepInputs(NamedTuple):
         y, ode = solve.encoded(problem)
         part, t0, t1 = solve.saveat.subs, problem.t0, problem.t1
         solver, flow, still = economical(solve.solver, solve.between()), solve.flow(), solve.is_still(y)
-        # An interval without length has no derivatives by its times.
-        start = jnp.where(t0 == t1, jax.lax.stop_gradient(t0), t0)
-        y = held(y, start, flow, ode) if still else y
+        # Where there is no step, what is saved moves with its times as the equations say, else as the steps do, if these are not still.
+        moves = t0 if still else jnp.where(t0 == t1, t0, jax.lax.stop_gradient(t0))
+        y = held(y, moves, flow, ode) if has_flow(solve.formulation, y) else y
         decode, conditions = Decode(flow, solve.solver, still), None
         if stop is not None:
             assert isinstance(solve.event, diffrax.Event)

@@ -25,6 +25,7 @@ from .between_steps import has_flow
 from .crossings import OnStates
 from .event_adjoint import at_event
 from .followed_steps import Stop
+from .no_length import row_times
 from .start import is_saved_part
 
 
@@ -102,12 +103,21 @@ def cotangents(
     still = inputs.view.decode.still
     times_move = jax.tree.leaves((numbers.t0, numbers.t1, numbers.dt0, numbers.part.ts))
     of_ends = (lambda times: times) if times_move and not still else lax.stop_gradient
-    # What is saved moves with its time as the equations say, but where no step is taken; and not at all where nothing is asked for that.
-    of_flow = (lambda t: jnp.where(last > 0, t, lax.stop_gradient(t))) if times_move else lax.stop_gradient
+    # What is saved moves with its time as the equations say, but where an event ends it at once; and not at all where nothing is asked
+    # for that.
+    moves = (last > 0) | (stop is None or stop.event < 0)
+    of_flow = (lambda t: jnp.where(moves, t, lax.stop_gradient(t))) if times_move else lax.stop_gradient
 
     def saved(numbers: PyTree, t: Time, y: Y) -> Any:
         all_of = eqx.combine(numbers, rest)
         return all_of.view(of_flow(t), y, all_of.ode)
+
+    # Without a step the end, too, is a row of the start; it is shown by another function where steps move as they do.
+    starts_apart = bool(part.t1 and times_move) and not still
+
+    def saved_of_start(numbers: PyTree, t: Time) -> Any:
+        all_of = eqx.combine(numbers, rest)
+        return all_of.view.as_still()(of_flow(t), all_of.y, all_of.ode)
 
     def values(numbers: PyTree, t: Time, y: Y) -> list[Any]:
         all_of = eqx.combine(numbers, rest)
@@ -202,7 +212,7 @@ def cotangents(
     of_y, of_numbers, zero = _zeros(_entry(points, 0)), _zeros(numbers), jnp.zeros_like(inputs.t0)
     of_t1, row = of_end, first + reached
     if part.t1:
-        of_last = _entry(wanted, row)
+        of_last = jax.tree.map(lambda x: jnp.where(starts_apart & (last == 0), 0, x), _entry(wanted, row))
         _, pull_back = jax.vjp(saved, numbers, inputs.t1, _entry(points, last))
         of_numbers, more_t1, of_y = pull_back(of_last)
         of_t1 = of_t1 + more_t1 + of_saved_times[row]
@@ -218,12 +228,23 @@ def cotangents(
         lambda carry: carry[0] >= 0, one_step, carry
     )
     of_numbers = _sum(of_numbers, begins(of_begin)[0])
-    if first or save_times.size:
-        _, pull_back = jax.vjp(saved, numbers, inputs.t0, inputs.y)
-        more_numbers, more_t0, more_y = pull_back(_of_start(wanted, first, jnp.where(last > 0, 0, reached)))
-        of_numbers, of_t0, of_y = _sum(of_numbers, more_numbers), of_t0 + more_t0, _sum(of_y, more_y)
     of_numbers = of_numbers._replace(y=_sum(of_numbers.y, of_y))
-    of_t0 = of_t0 + (of_saved_times[0] if first else 0)
+    if first or save_times.size or starts_apart:
+        rows = row_times(part, inputs.t0, inputs.t1)
+        count = jnp.where(last > 0, first, first + reached + starts_apart)
+
+        def row_of_start(carry: tuple[PyTree, ...]) -> Any:
+            k, of_numbers, of_rows = carry
+            i = jnp.where(k < first + reached, k, rows.size - 1)
+            _, pull_back = jax.vjp(saved_of_start, numbers, rows[i])
+            more_numbers, of_t = pull_back(_entry(wanted, k))
+            return k + 1, _sum(of_numbers, more_numbers), of_rows.at[i].add(of_t)
+
+        start = jnp.asarray(0), of_numbers, jnp.zeros_like(rows)
+        _, of_numbers, of_rows = lax.while_loop(lambda carry: carry[0] < count, row_of_start, start)
+        of_t0 = of_t0 + (of_rows[0] + of_saved_times[0] if first else 0)
+        of_t1 = of_t1 + (of_rows[-1] if starts_apart else 0)
+        of_times = of_times + of_rows[first : first + save_times.size]
     counts = jnp.arange(save_times.size) < reached
     return with_times(
         of_numbers, of_t0, of_t1, of_times + jnp.where(counts, of_saved_times[first : first + save_times.size], 0)
@@ -258,16 +279,6 @@ def _needed(
     last_saved = jnp.max(jnp.where(counts, numbers, -1))
     before = jnp.sum(jnp.isfinite(times) & (direction * (times - save_times[last_saved]) < 0)) - 1
     return first_saved, last_saved, jnp.where(last_saved < 0, -1, jnp.maximum(before, 0))
-
-
-def _of_start(wanted: PyTree[Array], first: int, times: IntScalar) -> PyTree[Array]:
-    """The cotangent of the start: its own where it was saved, and those of so many `times`: all of them where there was no step."""
-
-    def total(rows: Array) -> Array:
-        counts = jnp.arange(rows.shape[0]) < first + times
-        return jnp.sum(jnp.where(counts.reshape(-1, *[1] * (rows.ndim - 1)), rows, 0), axis=0)
-
-    return jax.tree.map(total, wanted)
 
 
 def _is_zero(tree: PyTree[Array]) -> Any:

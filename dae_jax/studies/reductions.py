@@ -5,6 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ..compiler import at_ease
@@ -96,14 +97,17 @@ def lyapunov(
     δy is the derivative of the solution (tangent dynamics, by `jax.jvp`) in one direction, which is made consistent with
     the constraints and the hidden ones: `direction`, with the structure of `y0`, by default 1 everywhere. `options` are
     those of `daesolve`, but for `event`, `saveat` and `adjoint`. Steps are chosen for δy as for the solution. NaN where a solve with
-    `throw=False` failed, where the direction is zero once it is consistent, and where δy is too large or too small for a number.
+    `throw=False` failed, where the direction is zero once it is consistent, where δy is too large or too small for a number, and where
+    times within `jit` leave no time.
     Derivatives of the exponent are found in forward mode (`jax.jacfwd`).
 
-    Errors: `TypeError` for one of these three; `ValueError` for a direction of another structure.
+    Errors: `TypeError` for one of these three; `ValueError` for a direction of another structure, and for t0 = t1.
     """
     for name in ("event", "saveat", "adjoint"):
         if name in options:
             raise TypeError(f"`lyapunov` takes no `{name}`: the exponent is that of the whole time from t0 to t1.")
+    if not any(isinstance(t, Tracer) for t in (t0, t1)) and t0 == t1:
+        raise ValueError(f"An exponent is found over a time, and from t0 = {t0} to t1 = {t1} there is none.")
     refuse_wrong_state(system, y0)
     y0 = as_floats(y0)
     along = jax.tree.map(jnp.ones_like, y0)
@@ -119,7 +123,8 @@ def lyapunov(
         return sol.final, sol
 
     _, last, sol = jax.jvp(end, (y0,), (start,), has_aux=True)
-    return _where_it_went_well(sol, jnp.log(_norm(last) / _norm(start)) / (t1 - t0), jnp.nan)
+    time = jnp.where(t0 == t1, jnp.nan, jnp.asarray(t1) - t0)
+    return _where_it_went_well(sol, jnp.log(_norm(last) / _norm(start)) / time, jnp.nan)
 
 
 _consistent_change = eqx.filter_jit(consistent_change)

@@ -1,6 +1,7 @@
 """The reverse derivative from the trajectory is that of diffrax's checkpoints."""
 
 import dataclasses
+import functools
 
 import diffrax
 import jax
@@ -129,22 +130,45 @@ def test_what_was_saved_before_a_solve_failed_has_its_derivative(solver, directi
     np.testing.assert_allclose(slope, -(at * np.exp(-2 * at)).sum(), rtol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["Tsit5", "projection", "bdf"])
-@pytest.mark.parametrize("saved", [dict(), dict(t0=True), dict(t1=True)], ids=str)
-def test_of_an_interval_without_length(name, saved):
-    """Where no step is taken, all that is saved is the start; the derivatives by times are 0."""
+@pytest.mark.parametrize("dt0", [None, 0.1], ids=["adaptive", "fixed"])
+@pytest.mark.parametrize(
+    ("name", "saved"),
+    [("Tsit5", dict(t1=True)), ("projection", dict()), ("projection", dict(t0=True, t1=True)), ("bdf", dict(t0=True))],
+    ids=str,
+)
+@pytest.mark.parametrize("jacobian", [jax.jacfwd, jax.jacrev])
+def test_of_an_interval_without_length(name, saved, dt0, jacobian):
+    """Where no step is taken, all that is saved is the start; it moves with each time as in any other interval."""
+    rate = np.cos(0.3) - np.sin(0.3)
 
-    def loss(angle, t0, t1, ts):
+    def values_and_times(angle, t0, t1, ts):
         y0 = (jnp.stack([jnp.sin(angle), jnp.cos(angle)]), jnp.stack([jnp.cos(angle), -jnp.sin(angle)]))
         saveat = diffrax.SaveAt(ts=ts, **saved)
-        (q, _) = dae_jax.daesolve(SCENE.system, SOLVERS[name], t0, t1, None, y0, saveat=saveat).ys
-        return jnp.sum(jnp.arange(1.0, 1 + len(q)) @ q)
+        sol = dae_jax.daesolve(SCENE.system, SOLVERS[name], t0, t1, dt0, y0, saveat=saveat)
+        return jnp.stack([jnp.sum(sol.ys[0], 1), sol.ts], 1)
 
-    of_angle, *of_times = jax.grad(loss, argnums=(0, 1, 2, 3))(0.3, 1.0, 1.0, jnp.ones(2))
+    by = jacobian(values_and_times, argnums=(0, 1, 2, 3))(0.3, 1.0, 1.0, jnp.ones(2))
+    of_angle, of_t0, of_t1, of_ts = (np.asarray(x) for x in by)
     rows = 2 + len(saved)
-    np.testing.assert_allclose(of_angle, rows * (rows + 1) / 2 * (np.cos(0.3) - np.sin(0.3)), rtol=1e-13)
-    for found in of_times:
-        np.testing.assert_array_equal(found, 0)
+    first, last = int("t0" in saved), int("t1" in saved)
+    is_t0, is_t1 = np.arange(rows) < first, np.arange(rows) >= rows - last
+    is_ts = np.eye(rows)[:, first : first + 2]
+    close = functools.partial(np.testing.assert_allclose, rtol=1e-12, atol=1e-12)
+    close(of_angle, np.stack([np.full(rows, rate), np.zeros(rows)], 1))
+    close(of_t0, np.stack([rate * is_t0 - rate, is_t0], 1))
+    close(of_t1, np.stack([rate * is_t1, is_t1], 1))
+    close(of_ts, np.stack([rate * is_ts, is_ts], 1))
+
+
+def test_of_intervals_with_and_without_length():
+    """In a batch, and of second order."""
+    end = lambda t1: dae_jax.daesolve(
+        SCENE.system, SOLVERS["projection"], 0.0, t1, None, (jnp.array([0.6, 0.8]), jnp.array([0.8, -0.6]))
+    ).final[0][0]
+    t1 = jnp.array([0.0, 1e-6, 0.0])
+    np.testing.assert_allclose(jax.vmap(jax.grad(end))(t1), 0.8, rtol=1e-5)
+    second = jax.vmap(jax.hessian(end))(t1)
+    np.testing.assert_allclose(second[::2], second[1], rtol=1e-5)
 
 
 def test_what_stays_has_no_cotangent():

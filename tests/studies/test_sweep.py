@@ -485,6 +485,12 @@ class TestOfASolveThatEndsEarly:
         with pytest.raises(TypeError, match=f"`lyapunov` takes no `{name}`"):
             reductions.lyapunov(PENDULUM.system, PROJECTED, 0.0, 2.0, PENDULUM.y0, **{name: None})
 
+    def test_an_exponent_of_no_time_is_refused(self):
+        exponent = lambda t1: reductions.lyapunov(PENDULUM.system, PROJECTED, 1.0, t1, PENDULUM.y0)
+        with pytest.raises(ValueError, match="from t0 = 1.0 to t1 = 1.0 there is none"):
+            exponent(1.0)
+        assert np.isnan(jax.jit(exponent)(1.0))
+
 
 def test_what_is_not_traceable_is_refused_in_a_sentence():
     with pytest.raises(ValueError, match="`fn` must be traceable by JAX, but makes numbers of what it is given"):
