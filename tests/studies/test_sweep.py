@@ -487,7 +487,7 @@ class TestOfASolveThatEndsEarly:
 
     def test_an_exponent_of_no_time_is_refused(self):
         exponent = lambda t1: reductions.lyapunov(PENDULUM.system, PROJECTED, 1.0, t1, PENDULUM.y0)
-        with pytest.raises(ValueError, match="from t0 = 1.0 to t1 = 1.0 there is none"):
+        with pytest.raises(ValueError, match="to t1 = 1"):
             exponent(1.0)
         assert np.isnan(jax.jit(exponent)(1.0))
 
