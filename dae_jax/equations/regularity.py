@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
-from ..linalg import factorised, minor_sign, row_products, semidefinite_solve, smallest_pivot, solve_with
+from ..linalg import factorised, least_sign, row_products, semidefinite_solve, smallest_pivot, solve_with
 from ..types import IntScalar, Phase, Time
 from .constraint_jacobian import Rank, mass_solve, matvec, unit_diagonal
 from .mechanical import MechanicalODE, allowed_contradiction
@@ -218,9 +218,9 @@ def has_rank(ode: MechanicalODE, t: Time, y: Phase, rank: Rank | None) -> tuple[
 
 
 def passes_singularity(ode: MechanicalODE, t0: Time, y0: Phase, t1: Time, y1: Phase, drifts: bool) -> Bool[Array, ""]:
-    """Whether det(A₁ M₀⁻¹ A₀ᵀ) < 0: between two flat states, the ends of a step, the gradients A of the constraints (of as many as are
-    independent) have passed a configuration in which they depend on each other, or turned by over a right angle. Of a method that
-    `drifts`, also whether the drift off the holonomic ones may have led past one.
+    """Whether A₁ M₀⁻¹ A₀ᵀ has a negative pivot: between two flat states, the ends of a step, the gradients A of the constraints (of as
+    many as are independent) have passed a configuration in which some depend on each other, or turned by over a right angle. Of a method
+    that `drifts`, also whether the drift off the holonomic ones may have led past one.
     """
     a0, a1 = ode.constraint_jacobian(t0, *y0), ode.constraint_jacobian(t1, *y1)
     _, lifted, scale = _schur_complement(ode, y0, a0)
@@ -230,8 +230,8 @@ def passes_singularity(ode: MechanicalODE, t0: Time, y0: Phase, t1: Time, y1: Ph
 
 def _drifted_over(ode: MechanicalODE, t: Time, y: Phase, g: Float[Array, "m n"]) -> Bool[Array, ""]:
     """Whether the gradients G at a flat state and G′ at the nearest one on the constraints, q − M⁻¹Gᵀ(G M⁻¹Gᵀ)⁻¹g to first order,
-    are as different as if a configuration in which they depend on each other were near: det(G M⁻¹Gᵀ + c (G′ − G) M⁻¹Gᵀ) < 0 for a
-    large c, of either sign. The drift may then have led to another branch of the motion.
+    are as different as if a configuration in which they depend on each other were near: G M⁻¹Gᵀ + c (G′ − G) M⁻¹Gᵀ has a negative pivot
+    for a large c, of either sign. The drift may then have led to another branch of the motion.
     """
     schur, lifted, scale = _schur_complement(ode, y, g)
     rank = None if ode.rank is None else ode.rank[0]
@@ -255,7 +255,7 @@ def _schur_complement(ode: MechanicalODE, y: Phase, g: Float[Array, "m n"]) -> t
 
 def _is_turned(product: Float[Array, "m m"], scale: Float[Array, " m"], rank: int | None) -> Bool[Array, ""]:
     rank = len(product) if rank is None else rank
-    return minor_sign(jax.lax.stop_gradient(product * scale[:, None] * scale), rank) < 0
+    return least_sign(jax.lax.stop_gradient(product * scale[:, None] * scale), rank) < 0
 
 
 def bearable_drift(tolerance: Float[ArrayLike, "..."], size: Num[ArrayLike, "..."]) -> Float[Array, "..."]:

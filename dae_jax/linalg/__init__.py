@@ -4,7 +4,7 @@ from .contraction import solve_contraction as solve_contraction
 from .definite_factors import Factors as Factors, factorised as factorised, solve_with as solve_with
 from .dense import (
     determinant_sign as determinant_sign,
-    minor_sign as minor_sign,
+    least_sign as least_sign,
     row_products as row_products,
     signed_log_determinant as signed_log_determinant,
     solve as solve,

@@ -60,13 +60,15 @@ def signed_log_determinant(a: Float[Array, "n n"]) -> tuple[Float[Array, ""], Fl
     return lax.fori_loop(0, len(a), eliminate, (a, jnp.ones((), a.dtype), jnp.zeros((), a.dtype)))[1:]
 
 
-def minor_sign(a: Float[Array, "n n"], rank: int) -> Float[Array, ""]:
-    """The sign of the largest principal minor of so many rows, about: the product of the pivots that are the largest on the
-    diagonal. Of A near S, symmetric, positive semidefinite and of that rank, it is that of det A on the range of S. Positive pivots come
-    first: a row that has changed its sign alone, and that depends on others, has not turned that range.
+def least_sign(a: Float[Array, "n n"], rank: int) -> Float[Array, ""]:
+    """The least sign of so many pivots, the largest on the diagonal: −1 where A, near S, which is symmetric, positive semidefinite and of
+    that rank, turns a direction of the range of S around, or several. Positive pivots come first: a row that has changed its sign alone,
+    and that depends on others, has not turned that range.
     """
     if rank == len(a) <= 2:
-        return jnp.sign(a[0, 0] if rank == 1 else a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0])
+        return jnp.sign(
+            a[0, 0] if rank == 1 else jnp.minimum(a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0], jnp.maximum(a[0, 0], a[1, 1]))
+        )
 
     def eliminate(_: IntScalar, carry: tuple[Float[Array, "n n"], Float[Array, ""]]):
         a, sign = carry
@@ -75,7 +77,7 @@ def minor_sign(a: Float[Array, "n n"], rank: int) -> Float[Array, ""]:
         pivot = jnp.sum(jnp.where(here, diagonal, 0))
         row, column = (jnp.sum(jnp.where(x, a, 0), k, keepdims=True) for k, x in enumerate((here[:, None], here)))
         left = jnp.where(here | here[:, None], 0, a - column * row / jnp.where(pivot == 0, 1, pivot))
-        return left, sign * jnp.sign(pivot)
+        return left, jnp.minimum(sign, jnp.sign(pivot))
 
     return lax.fori_loop(0, rank, eliminate, (a, jnp.ones((), a.dtype)))[1]
 

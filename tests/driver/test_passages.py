@@ -15,7 +15,7 @@ import pytest
 import dae_jax
 from benchmarks.stress.families.singular import dead_centre
 from dae_jax import AccuracyWarning, ConstrainedSystem, OrthogonalProjection
-from dae_jax.linalg import minor_sign
+from dae_jax.linalg import least_sign
 from dae_jax.scenes import SCENES
 
 
@@ -118,16 +118,30 @@ def test_the_answer_does_not_depend_on_units():
     np.testing.assert_allclose(ends[1].ys[0][0] / unit, ends[0].ys[0][0], atol=1e-4)
 
 
+@pytest.mark.parametrize("copies", [2, 4])
+def test_dead_centres_that_are_passed_at_once(copies):
+    """An even number of them in one step."""
+    case = dead_centre(1e-9)
+    system = ConstrainedSystem(
+        lambda t, q, v, a: jnp.zeros_like(q),
+        lambda t, q, a: jax.vmap(lambda q: case.system.constraint(t, q, a))(q.reshape(copies, -1)).ravel(),
+    )
+    y0 = tuple(jnp.tile(x, copies) for x in case.y0)
+    with pytest.warns(AccuracyWarning, match="dead centre"):
+        dae_jax.daesolve(system, METHODS["projection"][0], 0.0, 0.6, 0.01, y0, case.args)
+
+
 @pytest.mark.parametrize("rank", [1, 2, 3, 6])
-def test_sign_of_a_minor(rank):
+def test_least_sign_of_pivots(rank):
     rng = np.random.default_rng(rank)
     for _ in range(20):
         rows = rng.normal(size=(6, rank)) if rank < 6 else np.eye(6)
-        turned = np.diag(np.sign(rng.normal(size=rank))) + 0.1 * rng.normal(size=(rank, rank))
-        expected = np.sign(np.linalg.det(turned))
-        assert minor_sign(jnp.asarray(rows @ turned @ rows.T), rank) == expected
-    assert minor_sign(jnp.array([[2.0, 5.0], [1.0, 2.0]]), 2) == -1
-    assert minor_sign(jnp.array([[-3.0]]), 1) == -1
+        signs = np.sign(rng.normal(size=rank))
+        turned = np.diag(signs) + 0.1 * rng.normal(size=(rank, rank))
+        assert least_sign(jnp.asarray(rows @ turned @ rows.T), rank) == signs.min()
+    assert least_sign(jnp.array([[2.0, 5.0], [1.0, 2.0]]), 2) == -1
+    assert least_sign(jnp.array([[-3.0]]), 1) == -1
+    assert least_sign(-jnp.eye(2), 2) == -1
 
 
 @pytest.mark.parametrize(
