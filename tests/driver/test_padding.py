@@ -79,7 +79,11 @@ def test_a_batch_of_solutions_is_each_of_them():
     together = jax.vmap(lambda k: run(k)[1])(forces)
     found = dae_jax.multipliers(run(1.0)[0], together)
     for i, k in enumerate(forces):
-        np.testing.assert_allclose(found[i], dae_jax.multipliers(*run(k)), rtol=1e-10)
+        system, alone = run(k)
+        lane = jax.tree.map(lambda x: x[i], together)  # noqa: B023
+        np.testing.assert_allclose(found[i], dae_jax.multipliers(system, lane), rtol=1e-12)
+        # Round-off of an error makes steps longer or shorter.
+        np.testing.assert_allclose(lane.final[0], alone.final[0], rtol=1e-8)
 
 
 def test_largest_error_is_over_the_saved_times_and_infinite_for_a_failure():
