@@ -128,8 +128,11 @@ def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[
         direction, given = jnp.where(t1 < t0, -1, 1), known_to_conditions(solve, problem)
         conditions = conditions_of(event, decode, args, direction, given)
         event = dataclasses.replace(event, cond_fn=conditions, root_finder=bracketing(event.root_finder))
-    sums_errors = _may_ignore_errors(solve.controller) and not solve.recording
-    observers: dict[str, Observer] = {"errors": SummedErrors()} if sums_errors else {}
+    # What is doubtful about a solution is seen in itself, not where it is done again.
+    first = steps is None and not solve.recording
+    observers: dict[str, Observer] = {}
+    if first and _may_ignore_errors(solve.controller):
+        observers["errors"] = SummedErrors()
     looped = _for_loops(solve, solver, y, *_kinds(event, t0, y, ode), t0, t1)
     records = steps is None and (felt is not None or solve.records_steps())
     if records:
@@ -141,10 +144,11 @@ def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[
     looped = StillSteps(looped, flow, jumps) if still else looped
     state_is_read = known or counts(solver)
     saveat = dataclasses.replace(saveat, solver_state=True) if state_is_read else saveat
-    passage = passages(problem, ode, solve.formulation.decode, not solve.keeps()[0], solve.formulation.inverts_mass)
+    drifts, masses = not solve.keeps()[0], solve.formulation.inverts_mass
+    passage = passages(problem, ode, solve.formulation.decode, drifts, masses) if first else None
     if passage is not None:
         observers["passage"] = passage
-    switches = stepped_over(problem) if steps is None and not solve.recording else None
+    switches = stepped_over(problem) if first else None
     if switches is not None:
         observers["switches"] = switches
     if felt is not None and isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
@@ -163,7 +167,7 @@ def call(solve: "Solve", problem: Problem, steps: Steps | None = None) -> tuple[
         path = solver.whole_path(path)
     interpolation = None if path is None else Interpolation.of(path, decode, ode)
     ts, ys = cast(Any, sol.ts), cast(Any, sol.ys)
-    if has_flow(solve.formulation, y):
+    if has_flow(solve.formulation, y) and not solve.recording:
         begin = lambda fn: Begin(t0, start, flow, View(fn, decode, args).as_still(), ode)
         is_all = (t0 == t1) & ~jnp.any(jnp.stack([jnp.asarray(False), *jax.tree.leaves(sol.event_mask)]))
         ts["user"], ys["user"] = moving_with_times(solve.saveat.subs, ts["user"], ys["user"], begin, t1, is_all)

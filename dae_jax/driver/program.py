@@ -136,7 +136,7 @@ class Solve:
     max_steps: int | None
     # Whether a derivative that is not known is an error.
     throw: bool = False
-    # Whether the dense output is there for the trajectory alone.
+    # Whether it is done again for its trajectory, which the dense output is there for, or its steps alone.
     recording: bool = False
     # Whether steps are to be good between their ends though nothing is saved there.
     counts_between: bool = False
@@ -249,7 +249,8 @@ class Solve:
                 given, rest = changing(solve, problem)
                 # Of solvers of residuals the error between steps counts, if points there are asked for.
                 between = solve.between() and takes_residuals(solve.solver)
-                solve = dataclasses.replace(solve, adjoint=OneDirection(), saveat=saveat, counts_between=between)
+                again = {"adjoint": OneDirection(), "saveat": saveat, "counts_between": between, "recording": True}
+                solve = dataclasses.replace(solve, **again)
                 solved = lambda given: steps_of(*with_changes(solve, problem, eqx.combine(given, rest)), failed)
                 return by_felt_steps(solved, given, changes)
 

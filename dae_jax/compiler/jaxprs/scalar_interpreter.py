@@ -5,6 +5,7 @@ polynomial) and what arithmetic on it means is up to its subclasses.
 """
 
 import functools
+import math
 import operator
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
@@ -42,6 +43,25 @@ class Unsupported(Exception):
 
 # What an entry is.
 E = TypeVar("E")
+
+
+def _entries(eqn: Equation) -> int:
+    """How many an equation has at most: those of a result, and the products that it is the sum of."""
+    sizes = [v.aval.size for v in eqn.outvars]
+    if eqn.primitive.name == "dot_general":
+        contracted, _ = eqn.params["dimension_numbers"][0]
+        sizes.append(sizes[0] * math.prod(aval_of(eqn.invars[0]).shape[i] for i in contracted))
+    return max(sizes, default=0)
+
+
+def refuse_large(closed: ClosedJaxpr, limit: int) -> None:
+    """Raises `Unsupported` where an equation has more entries than the `limit`, which is found in no time."""
+    for eqn in closed.jaxpr.eqns:
+        if _entries(eqn) > limit:
+            raise Unsupported("too many entries")
+        inner = called(eqn, CALLS)
+        if inner is not None:
+            refuse_large(inner, limit)
 
 
 class ScalarInterpreter(Generic[E]):
@@ -110,10 +130,7 @@ class ScalarInterpreter(Generic[E]):
 
     def equation(self, eqn: Equation, args: list[np.ndarray]) -> list[np.ndarray]:
         name = eqn.primitive.name
-        sizes = [v.aval.size for v in eqn.outvars]
-        if name == "dot_general":
-            sizes.append(sizes[0] * int(np.prod([args[0].shape[i] for i in eqn.params["dimension_numbers"][0][0]])))
-        if max(sizes, default=0) > self.limit:
+        if _entries(eqn) > self.limit:
             raise Unsupported("too many entries")
         inner = called(eqn, CALLS)
         if inner is not None:

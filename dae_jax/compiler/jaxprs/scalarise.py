@@ -24,7 +24,7 @@ from jaxtyping import Array, PyTree
 from .._compat import low
 from ..types import Aval, Equation
 from .objects import is_number, objects
-from .scalar_interpreter import ScalarInterpreter, Unsupported
+from .scalar_interpreter import ScalarInterpreter, Unsupported, refuse_large
 
 
 # Above this many scalar operations straight-line code costs more to compile than it saves at run time.
@@ -51,19 +51,20 @@ def scalarise(fn: Callable[..., Any], limit: int = LIMIT) -> Callable[..., Any]:
         def flat(*flat_leaves: Array) -> Any:
             return fn(*jax.tree.unflatten(treedef, flat_leaves))
 
-        jaxpr, out = jax.make_jaxpr(flat, return_shape=True)(*leaves)
-        shapes, out_tree = jax.tree.flatten(out)
+        found, out = jax.make_jaxpr(flat, return_shape=True)(*leaves)
+        arrays, (shapes, out_tree) = low(found), jax.tree.flatten(out)
 
         def as_scalars(*flat_leaves: Array) -> list[jax.Array]:
-            outputs = _Scalars(limit).run(low(jaxpr), [_scalars(leaf) for leaf in flat_leaves])
+            outputs = _Scalars(limit).run(arrays, [_scalars(leaf) for leaf in flat_leaves])
             return [_array(o, s) for o, s in zip(outputs, shapes, strict=True)]
 
         try:
+            refuse_large(arrays, limit)
             # In a trace of its own, so that an attempt that is given up leaves nothing behind.
-            rewritten = jax.make_jaxpr(as_scalars)(*leaves)
+            found = jax.make_jaxpr(as_scalars)(*leaves)
         except Unsupported:
-            return fn(*args)
-        return jax.tree.unflatten(out_tree, jaxpr_as_fun(rewritten)(*leaves))
+            pass
+        return jax.tree.unflatten(out_tree, jaxpr_as_fun(found)(*leaves))
 
     return scalarised
 
