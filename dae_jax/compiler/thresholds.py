@@ -44,8 +44,8 @@ class Thresholds:
     - `longest_sort`: entries above which sorting, by comparing all pairs, is left to XLA: 64 take 5 µs and XLA's 3, 256 66 and 15.
 
     Size:
-    - `instructions`: more take longer to compile than they save. A four-bar linkage by dummy derivatives (75,000) is ready in 8 s and
-      takes 7.3 ms, by XLA's single kernel in 15 s and takes 20.
+    - `instructions`: more take minutes to compile. A four-bar linkage by dummy derivatives (75,000) is ready in 8 s and takes 7.3 ms, by
+      XLA's single kernel in 15 s and takes 20; of more than 200,000 XLA takes longer than anybody waits (see `emit.object_code`).
     - `ptx_lines`: lines of PTX above which NVIDIA's compiler optimises less: the gradient of a chain of 12 links (26,000) takes it
       5 s in place of 24, with a third less that does not fit into registers; of 8 links (25,000) 5 in place of 8.
     - `overestimate`: the estimate counts up to this many instructions for each that is written, since it knows of no zeros and of
@@ -78,7 +78,7 @@ class Thresholds:
     triangle_written_out: int = 7
     largest_matrix: int = 32
     longest_sort: int = 256
-    instructions: int = 200_000
+    instructions: int = 1_000_000
     ptx_lines: int = 20_000
     overestimate: int = 4
     whole: int = 15_000

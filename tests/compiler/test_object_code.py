@@ -16,6 +16,19 @@ from dae_jax.compiler.settings import configure
 from tests.compiler.samples import X, numbered
 
 
+@pytest.mark.parametrize(("often", "limit"), [(True, "LONG"), (False, "LONG_LOOK")])
+def test_what_is_long_is_compiled_in_the_least_time(monkeypatch, often, limit):
+    module, asked = written(jax.make_jaxpr(lambda x: x * 19)(X)), []
+    compiled = programs.compiled
+    monkeypatch.setattr(programs, "compiled", lambda *args: (asked.append(args[2]), compiled(*args))[1])
+    with configure(optimise=True):
+        for more in (2, 1):
+            monkeypatch.setattr(programs, limit, module.count("\n") + more)
+            # As a program of its own.
+            register(f"; {often} {more}\n{module}", often=often)
+    assert asked == [True, False]
+
+
 class TestLeastRecentlyUsed:
     def test_code_is_let_go_and_comes_back(self, monkeypatch):
         calls = []

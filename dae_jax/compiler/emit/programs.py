@@ -20,7 +20,7 @@ from jaxtyping import Array
 
 from ..settings import THREADS, current
 from . import background, host_functions, object_cache
-from .object_code import LONG_LOOK, key, object_code, parsed, verified
+from .object_code import LONG, LONG_LOOK, key, object_code, parsed, verified
 from .runtime import HANDLE, SHARE, STUBS, stubs, text as shared
 from .target import Target, host, llvm
 
@@ -68,14 +68,14 @@ def register(module: str, source: object = None, often: bool = True) -> str:
     """Begins to compile a module with a function `{name}.kernel`, and gives the name by which XLA calls it.
 
     `source` is what the module was written from, for people to read where the settings ask for a dump; `often`: whether how fast it is
-    counts, however long it takes to compile.
+    counts, if it does not take too long to compile.
 
     `module` is a format string for `{name}`, which is made of its contents: equal programs are compiled once, also where
     XLA's compilation cache holds the program that calls them.
 
     Errors: `Unsupported` for a module that is broken.
     """
-    target, optimise = host(), current().optimise and (often or module.count("\n") < LONG_LOOK)
+    target, optimise = host(), current().optimise and module.count("\n") < (LONG if often else LONG_LOOK)
     name = "dae_jax_" + hashlib.sha256(f"{target} {optimise} {module}".encode()).hexdigest()[:32]
     text = module.replace("{name}", name)
     with _lock:
