@@ -18,9 +18,14 @@ from tests.compiler.samples import X, numbered
 
 @pytest.mark.parametrize(("often", "limit"), [(True, "LONG"), (False, "LONG_LOOK")])
 def test_what_is_long_is_compiled_in_the_least_time(monkeypatch, often, limit):
-    module, asked = written(jax.make_jaxpr(lambda x: x * 19)(X)), []
-    compiled = programs.compiled
-    monkeypatch.setattr(programs, "compiled", lambda *args: (asked.append(args[2]), compiled(*args))[1])
+    module, asked, compiled = written(jax.make_jaxpr(lambda x: x * 19)(X)), [], programs.compiled
+
+    def noted(text, target, optimise=True):
+        asked.append(optimise)
+        return compiled(text, target, optimise)
+
+    programs.runtime()
+    monkeypatch.setattr(programs, "compiled", noted)
     with configure(optimise=True):
         for more in (2, 1):
             monkeypatch.setattr(programs, limit, module.count("\n") + more)

@@ -33,8 +33,8 @@ ADDRESSES, LOOPS = 4_000, 400
 # From as many lines on what is only looked at, as the start and the end of a solve, is made in the least time: of a four-bar linkage in
 # space (49,000) in 1.9 s in place of 5.
 LONG_LOOK = 10_000
-# From as many on any program is: the derivatives of Andrews' mechanism by dummy derivatives (248,000 and 275,000) are ready in 45 s and take
-# 50 ms, in place of 81 s and 30 ms. XLA, which they were left to before, had not compiled them in four minutes.
+# From as many on any program is: the derivatives of Andrews' mechanism by dummy derivatives (248,000 and 275,000) are ready in 45 s and
+# take 50 ms, in place of 81 s and 30 ms. XLA, which they were left to before, had not compiled them in four minutes.
 LONG = 200_000
 
 # Where the index of a loop over an array begins.
