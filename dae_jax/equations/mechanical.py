@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from .._compat import is_a_loop_without_reverse, lacks_reverse_derivatives
-from ..linalg import fixed_point, implicit_root, relative_change, solve
+from ..linalg import fixed_point, implicit_root, relative_change, roundoff, solve
 from ..structure.layout import Layout
 from ..systems import ConstrainedSystem
 from ..types import Args, DType, Flat, Phase, State, Time
@@ -24,6 +24,9 @@ from .sparse_constraint_jacobian import SPARSE_FROM, SparseConstraintJacobian, s
 # From so many constraints on the forces of multipliers are found by reverse derivatives, at the price of the constraints. Of fewer by
 # forward ones, which take no longer then, and which a branch that is not taken cannot make NaN.
 REVERSE_FROM = 8
+
+# How much less of what is not small beside its constraint may be round-off of other numbers in that.
+NEAR_1 = 100
 
 
 def allowed_contradiction(dtype: DType) -> float:
@@ -314,8 +317,18 @@ class MechanicalODE(ManifoldODE):
             delta = self.linear.schur_solve(self, here, self.constraint(t, q))
             dq = self.linear.lift(self, jacobian, delta)
         kappa = self.linear.schur_solve(self, here, self.velocity_constraint(t, q - dq, v))
-        sizes = relative_change(dq, q), relative_change(self.linear.lift(self, jacobian, kappa), v)
-        return -jnp.concatenate([delta, kappa]), jnp.maximum(*sizes)
+        dv = self.linear.lift(self, jacobian, kappa)
+        sizes = self._sizes_of(here, dq, q, self.holonomic), self._sizes_of(here, dv, v, None)
+        return -jnp.concatenate([delta, kappa]), tuple(map(jnp.maximum, *sizes))
+
+    def _sizes_of(self, jacobian: ConstraintJacobian, dx: Flat, x: Flat, rows: int | None) -> tuple[Any, Any]:
+        """The size of a correction relative to what is in each constraint, which may be small beside other unknowns and beside 1, but
+        0 where it is round-off of the largest; and what of it may be round-off, of that or of numbers near 1 in a constraint.
+        """
+        moved, whole = (self.linear.reach(self, jacobian, jnp.abs(s))[:rows] for s in (dx, x))
+        part = jnp.max(moved / jnp.where(moved > 0, moved + whole, 1), initial=0)
+        negligible = jnp.max(jnp.abs(dx), initial=0) <= roundoff(x.dtype) * jnp.max(jnp.abs(x), initial=0)
+        return jnp.where(negligible, 0, part), jnp.minimum(part, NEAR_1 * relative_change(dx, x))
 
 
 def _manifold_residual(mu: Float[Array, " c"], params: PyTree) -> Float[Array, " c"]:

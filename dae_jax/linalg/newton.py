@@ -73,14 +73,15 @@ def newton(
 
 
 def fixed_point(
-    correct: Callable[[Any], tuple[Any, Float[Array, ""]]],
+    correct: Callable[[Any], tuple[Any, Any]],
     x: Any,
-    last: Float[Array, ""] | None = None,
+    last: Any = None,
     max_steps: int = MAX_STEPS,
 ) -> tuple[Any, Bool[Array, ""]]:
     """Applies `correct`: x ↦ (x, relative size of the correction) until what remains is round-off; see `newton`.
 
-    `last`: the size of the correction δ that led to `x`, where one has been made that is known to leave about δ² behind.
+    The size may be a pair: by the first one corrections shrink, and by the second one those that no longer do may be round-off. `last`:
+    the size of the correction δ that led to `x`, where one has been made that is known to leave about δ² behind.
     """
     dtype = jnp.result_type(*jax.tree.leaves(x))
     tolerance = roundoff(dtype)
@@ -89,20 +90,23 @@ def fixed_point(
     # Where an equation is steep corrections are as small without being round-off.
     noise = 0.0 if proves_nothing else amplified_roundoff(dtype)
 
-    def stagnant(last: Any, previous: Any, turned: Any) -> Any:
+    def pair(size: Any) -> Any:
+        return size if isinstance(size, tuple) else (size, size)
+
+    def stagnant(last: Any, previous: Any, turned: Any, bound: Any) -> Any:
         # Round-off has no direction; corrections that go on in one are on their way down an equation that is steep.
-        return turned & (last > previous / 2) & (last < 1000 * tolerance) | (last >= previous) & (last < noise)
+        return turned & (last > previous / 2) & (bound < 1000 * tolerance) | (last >= previous) & (bound < noise)
 
     def unfinished(carry: Any) -> Bool[Array, ""]:
-        _, _, turned, last, previous, count = carry
+        _, _, turned, (last, bound), previous, count = carry
         remaining = last * jnp.minimum(last / previous, 1)
         if proves_nothing:
             remaining = jnp.where(count == 1, last, remaining)
         # A NaN compares false and ends the loop.
-        return (count < max_steps) & (remaining > tolerance) & ~stagnant(last, previous, turned)
+        return (count < max_steps) & (remaining > tolerance) & ~stagnant(last, previous, turned, bound)
 
     def body(carry: Any) -> Any:
-        x, delta, _, last, _, count = carry
+        x, delta, _, (last, _), _, count = carry
         new, size = correct(x)
         before, delta = delta, jax.tree.map(jnp.subtract, new, x)
         turned = _inner(delta, before) <= jnp.sqrt(_inner(delta, delta)) * jnp.sqrt(_inner(before, before)) / 2
@@ -111,17 +115,17 @@ def fixed_point(
             new,
             delta,
             turned,
-            size,
+            pair(size),
             jnp.where(last < jnp.inf, jnp.maximum(last, jnp.finfo(dtype).tiny), one),
             count + 1,
         )
 
     none = jax.tree.map(jnp.zeros_like, x)
-    first = (jnp.full((), jnp.inf, dtype), one, 0) if last is None else (last, one, 1)
-    x, _, turned, size, previous, _ = lax.while_loop(unfinished, body, (x, none, jnp.asarray(True), *first))
+    first = (pair(jnp.full((), jnp.inf, dtype)), one, 0) if last is None else (pair(last), one, 1)
+    x, _, turned, (size, bound), previous, _ = lax.while_loop(unfinished, body, (x, none, jnp.asarray(True), *first))
     remaining = size * jnp.minimum(size / previous, 1)
-    return x, (remaining <= tolerance) | (size <= previous / 2) & (size < 1000 * tolerance) | stagnant(
-        size, previous, turned
+    return x, (remaining <= tolerance) | (size <= previous / 2) & (bound < 1000 * tolerance) | stagnant(
+        size, previous, turned, bound
     )
 
 

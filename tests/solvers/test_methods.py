@@ -141,6 +141,34 @@ def test_symmetric_projection_does_not_depend_on_the_units_of_mass_and_constrain
     np.testing.assert_allclose(found, plain, rtol=0, atol=1e-12)
 
 
+SMALL = dae_jax.ConstrainedSystem(
+    lambda t, q, v, r: jnp.stack([0 * r, r, 0 * r]), lambda t, q, r: (q[:2] @ q[:2] - r**2) / 2
+)
+
+
+def swung(solver, length, beside, h, dtype=jnp.float64, **options):
+    """A pendulum beside an unknown of another size, in parts of these."""
+    units = jnp.array([length, length, beside], dtype)
+    start = (units * jnp.array([1.0, 0.0, 1.0], dtype), jnp.zeros(3, dtype))
+    (q,), (v,) = dae_jax.daesolve(SMALL, solver, 0.0, 2.0, h, start, jnp.asarray(length, dtype), **options).ys
+    return q / units, v / units
+
+
+@pytest.mark.parametrize(("length", "beside"), [(1.0, 2.0**27), (2.0**-27, 2.0**-27), (2.0**-14, 2.0**14)])
+@pytest.mark.parametrize("solver", [dae_jax.TangentSpace(diffrax.Tsit5()), dae_jax.RATTLE()])
+def test_what_is_small_beside_1_or_another_unknown_stays_on_its_constraints(solver, length, beside):
+    q, v = swung(solver, length, beside, 0.1)
+    assert abs(q[:2] @ q[:2] - 1) < 1e-14
+    assert abs(q[:2] @ v[:2]) < 1e-14
+    np.testing.assert_allclose(jnp.stack([q, v]), jnp.stack(swung(solver, 1.0, 1.0, 0.1)), atol=1e-12)
+
+
+def test_millimetres_in_float32():
+    solver, steps = dae_jax.TangentSpace(dae_jax.DOP853()), diffrax.PIDController(rtol=1e-5, atol=1e-8)
+    found = swung(solver, 1e-3, 1e-3, None, jnp.float32, stepsize_controller=steps)
+    np.testing.assert_allclose(found, swung(solver, 1.0, 1.0, None), atol=1e-3)
+
+
 @pytest.mark.parametrize("method", [m for m in METHODS if not m.twin], ids=lambda m: m.name)
 def test_a_state_in_float32_stays_one(method):
     """Beside float64, in which times and parameters are."""
