@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, PyTree
 from ..equations.constraint_jacobian import Rank, dense_mass
 from ..equations.manifold_ode import at_one_instant
 from ..equations.mechanical import MechanicalODE
-from ..linalg import newton, semidefinite_solve
+from ..linalg import newton, roundoff, semidefinite_solve
 from ..systems import ConstrainedSystem, System, is_mechanism
 from ..types import Args, DType, IntScalar, Phase, State, Time
 from ..validate.states import NUMBERS
@@ -145,7 +145,11 @@ class ChartODE(eqx.Module):
             return z, jnp.where(jnp.isfinite(distance), distance, jnp.inf)
 
         zs, distances = jax.vmap(refine)(jax.lax.stop_gradient(guesses))
-        reached = jnp.sqrt(distances) <= jnp.finfo(q.dtype).eps ** 0.5 * (1 + jnp.max(jnp.abs(q)))
+        # Of lengths that are small beside 1 no point is near all others.
+        largest = jnp.max(jnp.abs(q))
+        reached = jnp.sqrt(distances) <= jnp.finfo(q.dtype).eps ** 0.5 * largest + 10 * roundoff(q.dtype) * (
+            1 + largest
+        )
         # Of the points that are q, such as an angle and whole turns more, that nearest 0: the distances of all are rounding.
         best = jnp.argmin(jnp.where(reached, jnp.max(jnp.abs(zs), 1), jnp.inf))
         z, _ = newton(_normal_equations, jax.lax.stop_gradient(zs[best]), (self, t, q))
@@ -164,6 +168,7 @@ def _least_squares(ode: ChartODE, t: Time, z: Float[Array, " d"], x: Float[Array
 
 
 def _guesses(dimension: int, dtype: DType) -> Float[Array, "guesses d"]:
-    # Fixed, spread over the range of an angle: a chart is usually made of angles.
+    # Fixed, spread over the range of an angle: a chart is usually made of angles. The second one is near 0 in any unit.
     rng = np.random.default_rng(0)
-    return jnp.asarray(np.concatenate([np.full((1, dimension), 0.1), rng.uniform(-3, 3, (31, dimension))]), dtype)
+    near = np.full((2, dimension), [[0.1], [1e-15]])
+    return jnp.asarray(np.concatenate([near, rng.uniform(-3, 3, (31, dimension))]), dtype)

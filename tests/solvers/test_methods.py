@@ -169,6 +169,16 @@ def test_millimetres_in_float32():
     np.testing.assert_allclose(found, swung(solver, 1.0, 1.0, None), atol=1e-3)
 
 
+def test_a_chart_in_lengths_that_are_small_beside_1_starts_where_the_state_does():
+    arc = dae_jax.StateSpace(lambda t, z, r: r * jnp.stack([jnp.cos(z[0] / r), jnp.sin(z[0] / r), 1 + 0 * r]))
+    system = dae_jax.ConstrainedSystem(SMALL.force, lambda t, q, r: jnp.stack([(q[:2] @ q[:2] - r**2) / 2, q[2] - r]))
+    for r in (1e-5, 1e-8):
+        q = jnp.array([0.6 * r, 0.8 * r, r], jnp.float32)
+        start, r = (q, jnp.zeros_like(q)), jnp.asarray(r, jnp.float32)
+        sol = dae_jax.daesolve(system, diffrax.Tsit5(), 0.0, 1e-3, 1e-3, start, r, formulation=arc)
+        np.testing.assert_allclose(sol.ys[0][0] / r, q / r, atol=1e-5)
+
+
 @pytest.mark.parametrize("method", [m for m in METHODS if not m.twin], ids=lambda m: m.name)
 def test_a_state_in_float32_stays_one(method):
     """Beside float64, in which times and parameters are."""
