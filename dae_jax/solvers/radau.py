@@ -281,15 +281,15 @@ class RadauIIA13(AbstractRadauIIA):
     stages: ClassVar[int] = 7
 
 
-def _predicted(state: RadauState, h: Any) -> Float[Array, "s n"]:
-    """The stages on the last step's polynomial; 0 without one, or where it does not reach."""
-    method = coefficients(len(state.z))
-    ratio = h / jnp.where(state.h == 0, 1, state.h)
+def _predicted(step: Step, state: RadauState) -> Float[Array, "s n"]:
+    """The stages on the last step's polynomial, where it does not reach on its tangent; 0 without one."""
+    method = step.method
+    ratio = step.h / jnp.where(state.h == 0, 1, state.h)
     ahead = jnp.stack([along(state.z, 1 + float(c) * ratio) - state.z[-1] for c in method.nodes])
-    none = state.h == 0
     if method.reach < GROWTH:
-        none = none | (ratio > method.reach)
-    return jnp.where(none, 0, ahead)
+        tangent = jnp.stack([float(c) * step.h * step.sign * state.ydot for c in method.nodes])
+        ahead = jnp.where(ratio > method.reach, tangent, ahead)
+    return jnp.where(state.h == 0, 0, ahead)
 
 
 def _solve(step: Step, state: RadauState, tol: Tolerances) -> Any:
@@ -297,7 +297,7 @@ def _solve(step: Step, state: RadauState, tol: Tolerances) -> Any:
     smallest step with new ones for each correction.
     """
     h, smallest = step.h, step.smallest
-    predicted = jnp.where(smallest, 0, _predicted(state, h))
+    predicted = jnp.where(smallest, 0, _predicted(step, state))
     weights, differential = step.linearised.weights(h, tol.raised()), step.linearised.structure.differential
     pace = step.linearised.weights(h) / tol.scale(step.y0) if step.linearised.followed.any() else None
 

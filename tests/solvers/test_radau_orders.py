@@ -25,6 +25,17 @@ def adaptive(system, solver, t1, y0, rtol=1e-8, atol=None, args=None, **options)
     return dae_jax.daesolve(system, solver, 0.0, t1, None, y0, args, stepsize_controller=control, **options)
 
 
+@BOTH
+def test_steps_grow_where_equations_are_nonlinear_in_the_rates(solver):
+    """Beyond the reach of the last step's polynomial Newton's method starts from what rates were, not from rates of 0."""
+    right = lambda t: jnp.cos(t) ** 3 + jnp.cos(t) + 3 * jnp.sin(t)
+    system = dae_jax.ImplicitDAE(lambda t, y, yd, args: yd**3 + yd + 3 * y - right(t))
+    sol = adaptive(system, solver, 2.0, jnp.zeros(1))
+    np.testing.assert_allclose(sol.ys[0], np.sin([2.0]), rtol=1e-7)
+    assert sol.stats["num_rejected_steps"] <= 2
+    assert sol.stats["num_steps"] < 40
+
+
 OSCILLATORS = {
     "ODE": lambda t, y, yd, args: jnp.stack([yd[0] - y[1], yd[1] + y[0]]),
     "index 1": lambda t, y, yd, args: jnp.stack([yd[0] - y[2], yd[1] + y[0], y[2] - y[1]]),
