@@ -69,5 +69,10 @@ def _(primals: Any, tangents: Any) -> Any:
     change = jax.tree.map(or_zero, saved, change)
     if of_times is None and of_begin.t is None and not begin.flow.later:
         return saved, change
-    _, moved = eqx.filter_jvp(lambda times, begin: (times, begin.at(times)), (times, begin), (of_times, of_begin))
-    return saved, jax.tree.map(lambda x, dx: x if dx is None else jnp.where(is_all, dx, x), change, moved)
+
+    def moved() -> Any:
+        show = lambda times, begin: (times, begin.at(times))
+        _, found = eqx.filter_jvp(show, (times, begin), (of_times, of_begin))
+        return jax.tree.map(lambda x, dx: x if dx is None else dx.astype(x.dtype), change, found)
+
+    return saved, lax.cond(is_all, moved, lambda: change)

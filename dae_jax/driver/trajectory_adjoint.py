@@ -113,11 +113,13 @@ def cotangents(
         return all_of.view(of_flow(t), y, all_of.ode)
 
     # Without a step the end, too, is a row of the start; it is shown by another function where steps move as they do.
-    starts_apart = bool(part.t1 and times_move) and not still
+    flows = has_flow(inputs.formulation, inputs.y)
+    starts_apart = bool(part.t1 and times_move) and flows and not still
 
     def saved_of_start(numbers: PyTree, t: Time) -> Any:
         all_of = eqx.combine(numbers, rest)
-        return all_of.view.as_still()(of_flow(t), all_of.y, all_of.ode)
+        view = all_of.view.as_still() if flows else all_of.view
+        return view(of_flow(t), all_of.y, all_of.ode)
 
     def values(numbers: PyTree, t: Time, y: Y) -> list[Any]:
         all_of = eqx.combine(numbers, rest)

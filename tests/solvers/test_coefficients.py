@@ -86,6 +86,15 @@ PUBLISHED = {
 }  # fmt: skip
 
 
+def last_step(z, h, rate):
+    """What a step of that size has left, of one unknown."""
+    return radau.RadauState(jnp.asarray(z)[:, None], jnp.asarray(h), jnp.full(1, rate), *[None] * 6)
+
+
+def next_step(method, h):
+    return radau.Step(method, None, 1, jnp.asarray(0.0), jnp.asarray(h), jnp.zeros(1))
+
+
 @pytest.mark.parametrize(
     "method", [coefficients(stages) for stages in PUBLISHED], ids=lambda method: f"{method.stages} stages"
 )
@@ -152,17 +161,23 @@ class TestRadau:
     def test_stages_are_predicted_on_the_last_polynomial(self, method):
         """A cubic goes on as it is in a step of another size."""
         cubic, h, new = np.polynomial.Polynomial([0.0, 1.0, -0.4, 0.3]), 0.5, 0.2
-        last = radau.RadauState(jnp.asarray(cubic(h * method.nodes)[:, None]), jnp.asarray(h), *[None] * 7)
+        last = last_step(cubic(h * method.nodes), h, cubic.deriv()(h))
         expected = cubic(h + new * method.nodes) - cubic(h)
-        np.testing.assert_allclose(radau._predicted(last, new)[:, 0], expected, rtol=1e-11, atol=1e-11)
+        found = radau._predicted(next_step(method, new), last)[:, 0]
+        np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-11)
 
     def test_a_polynomial_of_high_degree_is_not_continued_far(self, method):
-        """By three stages into any step that diffrax makes next; by more where noise stays noise."""
-        noise = np.where(np.arange(method.stages) % 2, 1e-12, -1e-12)[:, None]
-        last = radau.RadauState(jnp.asarray(noise), jnp.asarray(1.0), *[None] * 7)
-        ahead = [np.abs(radau._predicted(last, jnp.asarray(ratio))).max() for ratio in (0.5, 1.2, 10.0)]
-        assert max(ahead) < 1e-6
-        assert (np.array(ahead) > 0).tolist() == [True, True, method.stages == 3]
+        """By three stages into any step that diffrax makes next; by more where noise stays noise, and farther along the rates."""
+        noise = np.where(np.arange(method.stages) % 2, 1e-12, -1e-12)
+        for ratio in (0.5, 1.2, 10.0):
+            still, moving = (
+                radau._predicted(next_step(method, ratio), last_step(noise, 1.0, rate))[:, 0] for rate in (0.0, 0.1)
+            )
+            assert np.max(np.abs(still)) < 1e-6
+            continued = ratio < 10 or method.stages == 3
+            assert np.any(np.asarray(still) != 0) == continued
+            expected = still if continued else 0.1 * ratio * method.nodes
+            np.testing.assert_allclose(moving, expected, rtol=1e-14)
 
     def test_what_the_start_of_the_step_before_says_of_the_way_between(self, method):
         """All of the error for a power one higher than the polynomial takes."""
