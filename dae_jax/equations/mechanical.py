@@ -274,7 +274,7 @@ class MechanicalODE(ManifoldODE):
         return self._retracted(t, y, jacobian, self._corrected(t, y, jacobian, jacobian))
 
     def _retracted(
-        self, t: Time, y: Phase, jacobian: ConstraintJacobian, first: Sequence[Array]
+        self, t: Time, y: Phase, jacobian: ConstraintJacobian, first: tuple[Any, Any]
     ) -> tuple[Any, Bool[Array, ""]]:
         def iterate(params: PyTree) -> tuple[Float[Array, " c"], Bool[Array, ""]]:
             *point, first = params
