@@ -25,7 +25,8 @@ from .sparse_constraint_jacobian import SPARSE_FROM, SparseConstraintJacobian, s
 # forward ones, which take no longer then, and which a branch that is not taken cannot make NaN.
 REVERSE_FROM = 8
 
-# How much less of what is not small beside its constraint may be round-off of other numbers in that.
+# A correction may be round-off of numbers near 1 in a constraint where it is so many times smaller beside 1 than it may be beside what is
+# in the constraint.
 NEAR_1 = 100
 
 
